@@ -44,6 +44,7 @@ ONLINE_FLOORS = [
     {"relocalization"},
     {"atlas"},
     {"frame_tracker"},
+    {"continued_refinement"},
     {"user_guidance"},
     {"solver"},
     {"known_object"},

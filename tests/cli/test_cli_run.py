@@ -230,6 +230,15 @@ def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
     assert not Path("run/.correcting").exists()
 
 
+def test_a_correction_says_before_it_starts_what_it_replaces(call, clip, script):
+    call("run", clip, *BOX, "--out", "run")
+    Path("run/export").mkdir()
+    script.faults[3] = PluginError("The tracker gave up.")  # as soon as it starts
+    assert "run/export shows the run as it is now" in call("correct", "run", "3:21,11,20,20").stderr
+    assert "export" not in call("correct", "run", "3:21,11,20,20", "--quiet").stderr
+    assert Path("run/export").is_dir()
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
-import shutil
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.results import layout
-from tracking3d.results.files import write_atomic
+from tracking3d.results.files import link_or_copy, write_atomic
 
 _FIRST_GAP = 4
 """Frames from one to the next in a short run; it is doubled whenever there are too many."""
@@ -143,19 +141,6 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
             path.unlink(missing_ok=True)
         elif path.suffix == ".npz":
             _compress(path)
-
-
-def link_or_copy(source: Path, target: Path) -> None:
-    """Hard-link a file that is never overwritten; copy it if that is not possible.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
 
 
 def _compress(path: Path) -> None:

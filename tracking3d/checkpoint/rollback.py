@@ -7,11 +7,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from tracking3d.checkpoint.milestones import Milestone, link_or_copy, milestones_in
+from tracking3d.checkpoint.milestones import Milestone, milestones_in
 from tracking3d.checkpoint.progress import read_journal
 from tracking3d.errors import InputError
 from tracking3d.results import layout
-from tracking3d.results.files import write_atomic, writing
+from tracking3d.results.files import link_or_copy, write_atomic, writing
 from tracking3d.results.records import jsonable, latest
 from tracking3d.results.run_reader import RunReader, read_records
 

@@ -38,7 +38,12 @@ def correct(
     from tracking3d.cli.summary import print_summary
 
     load_with_progress("tracking3d.pipeline.correct", quiet, kernels=True)
-    from tracking3d.pipeline.correct import correct_run, object_folders_of
+    from tracking3d.pipeline.correct import (
+        check_corrections,
+        correct_run,
+        object_folders_of,
+        replaced_by_correction,
+    )
     from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
@@ -46,6 +51,10 @@ def correct(
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     by_folder = object_folders_of(run, [parse_correction(text) for text in corrections])
+    for folder, theirs in by_folder.items():
+        check_corrections(folder, theirs)
+        for sentence in replaced_by_correction(folder, report) if not quiet else ():
+            typer.echo(sentence, err=True)
     for folder, theirs in by_folder.items():
         earlier = RunReader(folder)
         plan = plan_run(earlier.config, len(earlier.frames), report=report)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.shape import Shape
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
@@ -75,6 +76,19 @@ class RefiningSolver(Protocol, Generic[State]):
             mask: Its initial mask as it was.
             T_cam_obj: ``(4, 4)`` the causal estimate.
         """
+        ...
+
+
+@runtime_checkable
+class ContinuingSolver(Protocol, Generic[State]):
+    """A refining solver that can start from an earlier refinement, of which most frames keep their estimates."""
+
+    def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
+        """The state for ``refine_frame`` and ``result``, in place of ``refine``; None if it does not fit ``start``."""
+        ...
+
+    def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
+        """Take a frame whose refined pose ``(4, 4)`` stands, before ``refine_frame`` takes the next one."""
         ...
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
-from tracking3d.estimation.solver import GuidedSolver, RefiningSolver, Solver, State
+from tracking3d.estimation.refined_start import RefinedStart
+from tracking3d.estimation.solver import ContinuingSolver, GuidedSolver, RefiningSolver, Solver, State
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.lens import Lens
 
@@ -89,6 +90,18 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         """See `RefiningSolver.refine_frame`."""
         state, estimate = self._solver.refine_frame(state, self._frame(frame), self._mask(mask), T_cam_obj)
         return state, self._answer(estimate, mask)
+
+    def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
+        """See `ContinuingSolver.continue_refinement`."""
+        if not isinstance(self._solver, ContinuingSolver):
+            return None
+        continued: State | None = self._solver.continue_refinement(state, start)
+        return continued
+
+    def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
+        """See `ContinuingSolver.keep_frame`."""
+        kept: State = self._solver.keep_frame(state, self._frame(frame), T_cam_obj)
+        return kept
 
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]

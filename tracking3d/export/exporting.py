@@ -15,11 +15,11 @@ from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.files import writing
-from tracking3d.results.layout import ARBITRARY, OVERWRITE, partial_path, run_files
+from tracking3d.results.layout import ARBITRARY, EXPORT, OVERWRITE, partial_path, run_files
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_progress
 
-FOLDER = "export"
+FOLDER = EXPORT
 """Default folder of exports, in the run folder."""
 LABEL = "export.json"
 """Name of a file in every exported folder that describes the export and allows replacing it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ from tracking3d.checkpoint.progress import check_picture
 from tracking3d.checkpoint.run_state import RunState
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.pipeline.earlier_refinement import EarlierRefinement
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import (
     Decision,
@@ -22,6 +24,7 @@ from tracking3d.pipeline.refinement_steps import (
 )
 from tracking3d.reconstruction import BELIEVED, TextureView, keep_best_views, texture_view
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
+from tracking3d.reconstruction.held_adjustment import HeldAdjustment
 from tracking3d.rendering.backend import share_threads
 from tracking3d.results.files import decode_mask
 from tracking3d.results.records import FrameRecord
@@ -43,6 +46,7 @@ class FinalRefinement:
         work: Writes in another thread while the next frame is solved.
         initial: Score and reason of every frame's initial mask, by index.
         precomputed: What the last steps come to, if other processes have taken them.
+        earlier: The estimates that stand, if only some frames are refined.
     """
 
     def __init__(
@@ -54,24 +58,32 @@ class FinalRefinement:
         work: BackgroundWriter,
         initial: Mapping[int, tuple[float, str]],
         precomputed: PrecomputedRefinement | None = None,
+        earlier: EarlierRefinement | None = None,
     ) -> None:
         self._session, self._writer, self._estimates = tracked.session, writer, estimates
         self._state, self._work, self._initial = state, work, initial
         self._views: tuple[TextureView, ...] = ()
-        self._precomputed = precomputed
+        self._precomputed, self._earlier = precomputed, earlier
         wanted, camera = self._session.config.object, self._session.camera
+        look: GlobalAdjustment | HeldAdjustment
         if precomputed is not None:
             look = precomputed.look
+        elif earlier is not None:
+            look = HeldAdjustment(self._session.result(), camera, sorted(earlier.kept), earlier.changed)
         else:
             causal = sorted(estimates.causal)
             look = GlobalAdjustment(self._session.result(), camera, causal, wanted.adjustment_views)
-        self._last = RefinementSteps(estimates, look, fixed=tracked.corrections)
+        self._last = RefinementSteps(estimates, look, fixed=tracked.corrections, earlier=earlier)
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
-        """Estimate the object in a frame again; None if the frame has no causal estimate."""
-        estimates, state = self._estimates, self._state
+        """Estimate the object in a frame again, unless its estimate stands; None if it has no causal estimate."""
+        estimates, state, earlier = self._estimates, self._state, self._earlier
         if frame.index not in estimates.causal:
             return None
+        if earlier is not None and (record := earlier.kept.get(frame.index)) is not None:
+            if frame.index in earlier.leading:
+                self._session.keep_frame(frame, record.T_cam_obj)
+            return self._work.do(partial(self._keep, record, frame, earlier.folder))
         if state.kept:
             check_picture(state.kept, frame)
             if frame.index <= state.before.last_refined:
@@ -80,8 +92,9 @@ class FinalRefinement:
         mask = estimates.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
-        estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial)
-        kept = self._session.state_dict() if state.checkpoint else {}
+        estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial, earlier)
+        # A stopped refinement of some frames is begun again.
+        kept = self._session.state_dict() if state.checkpoint and earlier is None else {}
         return self._work.do(partial(self._write_refined, estimate, frame, mask, kept))
 
     def _write_refined(
@@ -89,14 +102,19 @@ class FinalRefinement:
     ) -> FrameRecord:
         estimates = self._estimates
         record = estimates.write(estimate, frame, initial)
-        self._state.save(
-            session,
-            last_refined=frame.index,
-            refined_lines=estimates.lines,
-            seconds=self._writer.seconds,
-            refinement_seconds=estimates.seconds,
-        )
+        if session:
+            self._state.save(
+                session,
+                last_refined=frame.index,
+                refined_lines=estimates.lines,
+                seconds=self._writer.seconds,
+                refinement_seconds=estimates.seconds,
+            )
         return self._collect(record, frame, estimate.mask if estimate else estimates.mask(record))
+
+    def _keep(self, record: FrameRecord, frame: Frame, folder: Path) -> FrameRecord:
+        self._estimates.keep(record, folder)
+        return self._collect(record, frame, self._estimates.mask(record))
 
     def _collect(self, record: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
         """Keep what the final poses, surface and texture can be taken from; the record as it is."""
@@ -138,7 +156,8 @@ class FinalRefinement:
     def collect_mask(self, frame: Frame) -> None:
         """Adjust the pose of a frame, and collect its evidence for the object's masks."""
         if self._last.masks is not None and frame.index in self._estimates.causal:
-            self._estimates.put(self._last.adjust(frame))
+            if self._earlier is None or frame.index not in self._earlier.kept:
+                self._estimates.put(self._last.adjust(frame))
             self._last.collect_mask(frame)
 
     def settle_masks(self) -> None:

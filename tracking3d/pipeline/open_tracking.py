@@ -28,7 +28,7 @@ from tracking3d.prompts.prompt import PromptSet, damaged_start_error
 from tracking3d.results.layout import RUN
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.both_ways import check_start_frame
-from tracking3d.video.source import FrameSource
+from tracking3d.video.source import FrameSource, known_indices
 
 _log = logging.getLogger(__name__)
 
@@ -164,9 +164,9 @@ def open_tracking(request: TrackRequest, earlier: Path | None = None) -> Iterato
             TrackedObject(Session(config, prompt, *lens, encoder), prompt, corrections)
             for prompt, corrections in zip(made, request.corrections, strict=True)
         )
-        selection = getattr(source, "selection", None)
+        indices = known_indices(source)
         for one in objects:
-            check_corrections_fit(one.corrections.values(), first, config.tracker.name, selection)
+            check_corrections_fit(one.corrections.values(), first, config.tracker.name, indices)
         in_turn = chain(skipped, [first], frames)
         yield OpenTracking(source, config, choice, prompts.start_frame, first, in_turn, objects)
     finally:

@@ -15,7 +15,7 @@ from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.progress import SavedState
 from tracking3d.checkpoint.resuming import Earlier, earlier_run, prompt_record
 from tracking3d.checkpoint.run_state import RunState
-from tracking3d.checkpoint.staging import stage_correction, take_over
+from tracking3d.checkpoint.staging import keeps_shape, stage_correction, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
@@ -31,7 +31,7 @@ from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.description import RunHeader
 from tracking3d.results.given_masks import keep_given_masks
 from tracking3d.results.layout import object_folders
-from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.video.source import FrameSource, source_notes
@@ -192,7 +192,7 @@ def record_tracking(
         if unfinished := [recording for recording in recordings if recording is not None]:
             run_passes(opened.source, opened.frames, unfinished, listener, options.first_pass_only)
     for into, recording in zip(folders, recordings, strict=True):
-        if recording is not None and not options.first_pass_only:
+        if recording is not None and not recording.corrects and not options.first_pass_only:
             make_final_shape(into, opened.config, opened.source)
         if not options.first_pass_only:
             apply_object_size(into, opened.config.object)
@@ -238,8 +238,13 @@ def begin_recording(
     if earlier == "finished":
         finish_state(folder)
         return None
+    corrected: Path | None = None
     if earlier == "outdated":
+        corrected = folder
         folder, earlier = stage_correction(folder, header.config, options.selection, given, writers)
+        writers.callback(_reconstruct_shape_again, corrected, folder, opened)
+        if earlier == "finished":
+            return None
     checkpoint: Checkpoint | None = None
     kept: SavedState | None = None
     if earlier == "stopped":
@@ -258,7 +263,13 @@ def begin_recording(
     elif not temporary and source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.rollback_points)
     state = RunState(checkpoint, kept)
-    return ObjectRecorder(one, writer, state, opened.start_frame is not None, temporary)
+    return ObjectRecorder(one, writer, state, opened.start_frame is not None, temporary, corrected)
+
+
+def _reconstruct_shape_again(corrected: Path, stage: Path, opened: OpenTracking) -> None:
+    """Reconstruct the shape of a corrected run if that of the run was, before it takes the run's place."""
+    if is_finished(stage) and keeps_shape(corrected):
+        make_final_shape(stage, opened.config, opened.source, always=True)
 
 
 def _header(

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from tracking3d.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
@@ -13,11 +14,12 @@ from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.pipeline.earlier_refinement import EarlierRefinement, find_earlier_refinement
 from tracking3d.pipeline.final_refinement import FinalRefinement
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
 from tracking3d.pipeline.session import Session
-from tracking3d.prompts.corrections import prompts_in
+from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -39,6 +41,7 @@ class ObjectRecorder:
         state: How far the run is; the session was given the state of the stopped run, if there is one.
         redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
         temporary: Whether the run folder is removed in the end, so that errors do not name it.
+        corrected: The folder of the run before it was corrected, if a correction is computed.
 
     Attributes:
         latest: The estimate for the frame that was taken last.
@@ -53,12 +56,15 @@ class ObjectRecorder:
         state: RunState,
         redraw: bool = False,
         temporary: bool = False,
+        corrected: Path | None = None,
     ) -> None:
         self._tracked, self._session = tracked, tracked.session
+        self._corrected = corrected
+        self._earlier: EarlierRefinement | None = None
         self._writer, self._state = writer, state
         self._redraw, self._temporary = redraw, temporary
         self._work = BackgroundWriter()  # all that touches writer and state while frames come
-        self._unmet = set(tracked.corrections)
+        self._unmet = UnmetCorrections(tracked.corrections)
         self._answered = state.kept is not None
         self._warned = False
         self._initial: dict[int, tuple[float, str]] = {}
@@ -68,6 +74,11 @@ class ObjectRecorder:
         self.latest: FrameEstimate | None = None
         self.refinement: FinalRefinement | None = None
         self.precomputed: PrecomputedRefinement | None = None
+
+    @property
+    def corrects(self) -> bool:
+        """Whether this is the correction of a run, in a copy that takes the run's place."""
+        return self._corrected is not None
 
     @contextmanager
     def writing_beside(self) -> Iterator[None]:
@@ -99,10 +110,9 @@ class ObjectRecorder:
         Returns:
             The frame for the listener: this one, or the one before while `writing_beside`.
         """
-        if isinstance(frame, Frame):
-            self._unmet.discard(frame.index)
+        self._unmet.see(frame)
         if self._state.kept and self._state.has(frame.index):
-            return self._replay_saved(self._state.kept, frame)
+            return self._replay_saved(self._state.kept, frame, coming)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or self._state.has(coming.index):
@@ -148,7 +158,7 @@ class ObjectRecorder:
         return record
 
     def _replay_saved(
-        self, kept: SavedState, frame: Frame | SkippedFrame
+        self, kept: SavedState, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None
     ) -> FrameRecord | SkippedFrame | None:
         """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
         if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
@@ -158,7 +168,12 @@ class ObjectRecorder:
         check_picture(kept, frame)
         assert isinstance(frame, Frame)
         if self._session.replays:
+            self._session.coming = coming if isinstance(coming, Frame) else None
             self._replay(kept, frame)
+        if self._corrected is not None and self._refines:
+            return self._writer.kept_record(
+                frame.index
+            )  # drawn once it is refined; nobody looks at the copy before
         return self._writer.draw_again(frame)
 
     def _replay(self, kept: SavedState, frame: Frame) -> None:
@@ -185,10 +200,7 @@ class ObjectRecorder:
 
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: refine everything, or record why not though it was asked for."""
-        for index in sorted(self._unmet):
-            _log.warning(
-                "Frame %d, which was to be corrected, is not among the frames that could be read.", index
-            )
+        self._unmet.warn()
         estimates = self._open_refinement(source)
         if estimates is not None:
             estimates.together = self._session.refining
@@ -201,6 +213,7 @@ class ObjectRecorder:
                 self._work,
                 self._initial,
                 self.precomputed,
+                self._earlier,
             )
         elif self._redraw:
             self._writer.begin_drawing_again()
@@ -226,6 +239,8 @@ class ObjectRecorder:
         report_progress("refining the map")
         self._causal_model = self._session.result()
         estimates = self._writer.begin_refinement(self._causal_model)
+        if self._continue_earlier(estimates):
+            return estimates
         self._session.refine()
         self._state.save(
             self._session.state_dict(),
@@ -234,6 +249,21 @@ class ObjectRecorder:
             refinement_seconds=estimates.seconds,
         )
         return estimates
+
+    def _continue_earlier(self, estimates: RefinementWriter) -> bool:
+        """If this corrects a run, and most of its refined estimates stand, start from these; whether it was done."""
+        if self._corrected is None:
+            return False
+        earlier = find_earlier_refinement(self._corrected, self._writer.folder, estimates.causal)
+        if earlier is None or not self._session.continue_refinement(earlier.start):
+            _log.info("The correction changes most of the run: the final refinement takes all frames again.")
+            return False
+        self._earlier = earlier
+        _log.info(
+            "The final refinement takes %d frames again; the others keep their estimates.",
+            len(earlier.changed),
+        )
+        return True
 
     @property
     def needs_second_pass(self) -> bool:

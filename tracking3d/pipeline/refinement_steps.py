@@ -26,9 +26,11 @@ from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
+from tracking3d.pipeline.earlier_refinement import EarlierRefinement
 from tracking3d.pipeline.session import Session
 from tracking3d.reconstruction.confidence import assess_estimate
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
+from tracking3d.reconstruction.held_adjustment import HeldAdjustment
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import adjusted_record
@@ -55,7 +57,11 @@ class PrecomputedRefinement:
 
 
 def estimate_again(
-    session: Session, frame: Frame, causal: FrameRecord, initial: MaskEstimate
+    session: Session,
+    frame: Frame,
+    causal: FrameRecord,
+    initial: MaskEstimate,
+    earlier: EarlierRefinement | None = None,
 ) -> FrameEstimate | None:
     """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may continue.
 
@@ -64,12 +70,16 @@ def estimate_again(
         frame: The frame; frames come in order of time.
         causal: Its causal estimate.
         initial: Its initial mask.
+        earlier: The estimates that stand, if only some frames are refined.
 
     Raises:
         PluginError: If a plug-in fails, with ``runtime.on_plugin_failure`` ``stop``.
     """
+    T_cam_obj = causal.T_cam_obj
+    if earlier is not None:
+        T_cam_obj = earlier.start.predict(frame.index, T_cam_obj, causal.through(session.camera).fx)
     try:
-        return session.refine_frame(frame, initial, causal.T_cam_obj)
+        return session.refine_frame(frame, initial, T_cam_obj)
     except PluginError:
         if session.config.runtime.on_plugin_failure == "stop":
             raise
@@ -84,6 +94,7 @@ class RefinementSteps:
         look: Adjusts poses, surface and lens.
         masks: Decides masks; None until `begin_masks`.
         fixed: Indices of frames whose masks the user has given: those stand.
+        earlier: The estimates that stand, if only some frames are refined.
 
     Attributes:
         look: As given.
@@ -93,11 +104,12 @@ class RefinementSteps:
     def __init__(
         self,
         estimates: RefinedEstimates,
-        look: GlobalAdjustment,
+        look: GlobalAdjustment | HeldAdjustment,
         masks: VideoSegmenter | None = None,
         fixed: Collection[int] = (),
+        earlier: EarlierRefinement | None = None,
     ) -> None:
-        self._estimates, self._fixed = estimates, fixed
+        self._estimates, self._fixed, self._earlier = estimates, fixed, earlier
         self.look, self.masks = look, masks
         self._waiting: dict[int, Frame] = {}
 
@@ -130,7 +142,8 @@ class RefinementSteps:
         """Begin with the masks; which poses are reliable is taken from the estimates as they are now."""
         known = {one.index: one.confidence for one in self._estimates.all() if _has_pose(one)}
         pinhole = replace(self.look.camera, lens=None)
-        self.masks = VideoSegmenter(pinhole, self.look.vertices_of_landmarks, self.look.faces, known)
+        due = None if self._earlier is None else self._earlier.near
+        self.masks = VideoSegmenter(pinhole, self.look.vertices_of_landmarks, self.look.faces, known, due)
 
     def collect_mask(self, frame: Frame) -> None:
         """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
@@ -146,6 +159,10 @@ class RefinementSteps:
     def decide(self, frame: Frame) -> Iterator[Decision]:
         """Take the next frame, in order of time; gives those whose turn has come."""
         assert self.masks is not None
+        if self._earlier is not None and frame.index not in self._earlier.shown:
+            yield from self.decide_rest()
+            yield frame, None
+            return
         self._waiting[frame.index] = frame
         yield from map(self._make_decision, self.masks.decide(self._segmentation_input(frame)))
 

@@ -13,7 +13,7 @@ from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
-from tracking3d.estimation.solver import GuidedSolver, RefiningSolver, Solver
+from tracking3d.estimation.solver import GuidedSolver, Solver
 from tracking3d.estimation.tracker_feedback import corrects
 from tracking3d.estimation.undistortion import undistort_solver
 from tracking3d.features.protocol import FeatureEncoder
@@ -31,6 +31,7 @@ from tracking3d.pipeline.components import (
 from tracking3d.pipeline.frame_order import FrameOrder
 from tracking3d.pipeline.known_object import load_known_object, select_camera
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
+from tracking3d.pipeline.session_refinement import SessionRefinement
 from tracking3d.pipeline.validation import check_frame, check_session
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.prompts.prompt import check_prompt_fits
@@ -38,7 +39,7 @@ from tracking3d.runtime.isolation import IsolatedRuntime, RandomState
 from tracking3d.runtime.stage_times import StageTimes, measure
 
 
-class Session:
+class Session(SessionRefinement):
     """One object tracked through one video: ``step`` takes each frame, ``result`` gives the object.
 
     The process's threads and random numbers are the session's only while it works; in between they are the caller's.
@@ -219,6 +220,8 @@ class Session:
         try:
             with self._replaying.in_force():
                 estimate = self._tracker.start(frame) if first else self._tracker.step(frame, prompt)
+                if not first:
+                    self._tracker.announce(self.coming)
                 if correction is not None:
                     self._tracker.correct(frame, correction)
         except PluginFailure as error:
@@ -305,52 +308,3 @@ class Session:
             raise RuntimeError("there is no object before the first step")
         with self._settings.in_force():
             return self._solver.result(self._state)
-
-    @property
-    def can_refine(self) -> bool:
-        """Whether the solver can look at the whole video once more; known from the first frame on."""
-        return isinstance(self._solver, RefiningSolver)
-
-    def refine(self) -> None:
-        """Refine the whole model with the observations of the whole video.
-
-        A focal length that was not given may be estimated too: ``camera`` is then that of the refined estimates.
-        Do not call ``step`` afterwards: ``refine_frame`` refines each frame, and ``result`` gives the final object.
-
-        Raises:
-            RuntimeError: If the solver cannot, see ``can_refine``.
-        """
-        with self._settings.in_force(), measure("map") as watch:
-            self._state = self._refining().refine(self._state)
-        self.refining = watch.times
-        self._camera = getattr(self._state, "camera", self._camera)
-        self._refined = True
-
-    def refine_frame(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
-        """Estimate for a frame once more, against the final object. Frames come in order of time.
-
-        Args:
-            frame: The frame.
-            mask: Its initial mask as it was, see ``initial_mask``.
-            T_cam_obj: ``(4, 4)`` the causal estimate.
-
-        Raises:
-            PluginError: If a plug-in fails; the causal estimate then stands, and the next frame may be asked for.
-            RuntimeError: Before ``refine``.
-        """
-        solver = self._refining()
-        if not self._refined:
-            raise RuntimeError("frames are revisited after refine")
-        try:
-            with self._settings.in_force(), measure("solve") as watch:
-                shown = self._presented.number(frame)
-                self._state, estimate = solver.refine_frame(self._state, shown, mask, T_cam_obj)
-                estimate = self._presented.index(estimate)
-        except PluginFailure as error:
-            raise error.at(frame.label) from error.__cause__
-        return add_times(self._with_failure(replace(estimate, refined=True)), watch, frame)
-
-    def _refining(self) -> RefiningSolver[Any]:
-        if not isinstance(self._solver, RefiningSolver):
-            raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")
-        return self._solver

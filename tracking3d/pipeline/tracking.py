@@ -22,6 +22,7 @@ from tracking3d.pipeline.passes import ActiveRecordings, run_refinement
 from tracking3d.pipeline.point_queries import PointFollowing
 from tracking3d.pipeline.record import RecordOptions, begin_recording
 from tracking3d.pipeline.result import TemporaryRun, TrackingResult
+from tracking3d.prompts.corrections import UnmetCorrections
 from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.run_unit import apply_object_size
 
@@ -166,9 +167,12 @@ def track_frames(
                 return
             raise
         objects, recording = _ObjectsInStep(opened.objects), None
+        unmet = [UnmetCorrections(one.corrections) for one in opened.objects if run is None]
         if run is not None:
             recording = begin_recording(opened, 0, run.folder, RecordOptions(), ends, temporary=True)
         for frame in opened.frames:
+            for one in unmet:
+                one.see(frame)
             if recording is not None:
                 recording.take(frame)
             if not isinstance(frame, Frame):
@@ -177,6 +181,8 @@ def track_frames(
                 yield frame, opened.objects, objects.step(frame)
             elif recording.latest is not None:
                 yield frame, opened.objects, (recording.latest,)
+        for one in unmet:
+            one.warn()
         if recording is not None:
             run_refinement(opened.source, ActiveRecordings([recording]))
     if run is not None:

@@ -11,7 +11,7 @@ from tracking3d.results.run_notes import note_in_run
 from tracking3d.video.source import FrameSource
 
 
-def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource) -> str:
+def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, always: bool = False) -> str:
     """Reconstruct the shape of a finished run if ``object.shape`` is ``fine``; if that is not possible, the mesh stays.
 
     What came of it stands in ``run.json`` under ``shape`` too.
@@ -20,6 +20,7 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource) 
         folder: The run folder.
         config: Config of the run.
         source: Its video.
+        always: Reconstruct it whatever the config says.
 
     Returns:
         What came of it, in a sentence; empty if nothing was asked.
@@ -27,7 +28,7 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource) 
     Raises:
         OutputError: If something cannot be written.
     """
-    if config.object.shape != "fine":
+    if config.object.shape != "fine" and not always:
         return ""
     if source.repeatable:
         try:

@@ -93,6 +93,7 @@ def refinement(
     refined: Sequence[FrameRecord] = (),
     seconds: float = 0.0,
     together: StageTimes | None = None,
+    kept: int = 0,
 ) -> dict[str, Any]:
     """The outcome of a final refinement.
 
@@ -103,12 +104,14 @@ def refinement(
         refined: The refined estimates.
         seconds: Wall time it took.
         together: Times of the global refinement of the map, before the frames.
+        kept: Number of refined estimates that are those of the run before its last correction.
     """
     return {
         "state": state,
         "reason": reason,
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
+        "kept_refined": kept if refined else 0,
         "seconds": seconds,
         "stages": _plain(stages_of(refined), together),
         "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +57,19 @@ def write_atomic(path: Path, data: bytes) -> None:
         except OSError:
             partial.unlink(missing_ok=True)
             raise
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Hard-link a file that is never overwritten; copy it if that is not possible.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def write_reserved(path: Path, data: bytes, reserve: int) -> None:

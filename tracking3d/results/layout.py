@@ -19,6 +19,7 @@
     .state/             checkpoint of a stopped run; in a finished run, checkpoints for corrections
     prompts/            the given masks of the object, named by frame index
     .correcting/        a run folder: the corrected run, until it is finished
+    export/             what was exported; export_before_correction/ once the run has been corrected
 """
 
 from __future__ import annotations
@@ -58,6 +59,9 @@ TEXTURE = "texture.png"
 GLB = "mesh.glb"
 FEATURES = "features.npz"
 LANDMARKS = "landmarks.npz"
+EXPORT = "export"
+EXPORT_BEFORE = "export_before_correction"
+"""What was exported of a run before it was corrected."""
 
 ARBITRARY, METRE = "arbitrary", "metre"
 """Units of length of a run: its own, and that of a run whose object was measured."""

@@ -20,7 +20,7 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import write_atomic, writing
+from tracking3d.results.files import link_or_copy, write_atomic, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability
 from tracking3d.results.records import FrameRecord
@@ -42,6 +42,7 @@ class RefinementWriter(RefinedEstimates):
     Attributes:
         pictures: Overlay and crops of the second pass.
         together: Times of the global refinement of the map, before the frames.
+        kept: Number of estimates that are those of an earlier refinement.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -59,7 +60,7 @@ class RefinementWriter(RefinedEstimates):
         aside = folder / layout.REFINING
         self._started = time.monotonic() - seconds
         self._taken_over = False
-        self.together = StageTimes()
+        self.together, self.kept = StageTimes(), 0
         self.pictures = Pictures(aside / layout.OVERLAY, camera, fps)
         with writing(aside):
             (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
@@ -121,6 +122,30 @@ class RefinementWriter(RefinedEstimates):
         self._records[record.index] = record
         return record
 
+    def keep(self, record: FrameRecord, earlier: Path) -> None:
+        """Take the refined estimate for one frame from another run of the same frames.
+
+        Args:
+            record: The estimate.
+            earlier: The folder of that run.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        with writing(self._aside):
+            link_or_copy(layout.mask_path(earlier, record.index), layout.mask_path(self._aside, record.index))
+            if (
+                self.writes_probabilities
+                and (file := layout.probability_path(earlier, record.index)).is_file()
+            ):
+                place = layout.probability_path(self._aside, record.index)
+                place.parent.mkdir(exist_ok=True)
+                link_or_copy(file, place)
+            with (self._aside / layout.FRAMES).open("ab") as lines:
+                lines.write(record.to_json().encode() + b"\n")
+        self._records[record.index] = record
+        self.kept += 1
+
     def take_over(self, append: Callable[[Sequence[FrameRecord]], None]) -> None:
         """Put masks and video in their places; what they replace goes to ``causal/``, the mesh too.
 
@@ -171,7 +196,7 @@ class RefinementWriter(RefinedEstimates):
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
-        return description.refinement(state, reason, causal, refined, self.seconds, self.together)
+        return description.refinement(state, reason, causal, refined, self.seconds, self.together, self.kept)
 
 
 def adjusted_record(

@@ -136,6 +136,28 @@ def scale_run(folder: Path, object_size: float) -> None:
     _scale_by(folder, now, factors)
 
 
+def read_own_records(run: RunReader) -> list[FrameRecord]:
+    """The frames of a run in the unit that it was estimated in.
+
+    Raises:
+        InputError: The run is being scaled, and was interrupted.
+    """
+    if run.description.get("scaling"):
+        raise InputError(f"{run.folder} is in two units, since its scaling was interrupted; scale it again.")
+    if run.unit != METRE:
+        return run.frames
+    return latest(read_records(run.folder / layout.FRAMES, _scales(run).own_lines), refined=run.refined)
+
+
+def load_own_model(run: RunReader, mesh_folder: Path) -> ObjectModel:
+    """The final mesh of a run, or its online one, in the unit that the run was estimated in.
+
+    Raises:
+        InputError: There is no such mesh, or it is damaged.
+    """
+    return scale_model(load_model(mesh_folder), 1 / _scales(run).scale)
+
+
 def _scale_by(folder: Path, now: Scales, factors: Mapping[Path, float]) -> None:
     """Note what the scaling comes to, so that it can be completed if it is interrupted, and scale."""
     extents = {

@@ -112,6 +112,10 @@ class RunWriter:
         """Bytes of ``frames.jsonl`` that are written."""
         return self._lines.size
 
+    def kept_record(self, index: int) -> FrameRecord | None:
+        """The estimate that a frame had before the run was stopped; None if it had none."""
+        return self._kept.get(index)
+
     def draw_again(self, frame: Frame) -> FrameRecord | None:
         """Draw a frame that was estimated before the run was stopped; None if it has no estimate."""
         record = self._kept.get(frame.index)

@@ -8,7 +8,7 @@ time telling which motion it has.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -60,6 +60,7 @@ class VideoSegmenter:
         vertices: ``(V, 3)`` of the object.
         faces: ``(F, 3)``.
         confidences: Of the frames that have a pose, by index.
+        due: Indices of the frames that are decided; all if None.
 
     Attributes:
         order: The latest frames of the second time.
@@ -71,8 +72,10 @@ class VideoSegmenter:
         vertices: NDArray[np.float64],
         faces: NDArray[np.int64],
         confidences: dict[int, float],
+        due: Collection[int] | None = None,
     ) -> None:
         self._camera, self._vertices, self._faces = camera, vertices, faces
+        self._due = due
         chosen = sorted(index for index, confidence in confidences.items() if confidence >= _BELIEVED)
         chosen = chosen or sorted(confidences)
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
@@ -114,11 +117,12 @@ class VideoSegmenter:
             yield from self._begin(self._waiting.popleft())
 
     def rest(self) -> Iterator[tuple[int, SegmentedMask | None]]:
-        """Those that are left when there are no more frames; see `decide`."""
+        """Those that are left when there are no more frames, or when some are passed over; see `decide`."""
         while self._waiting:
             yield from self._begin(self._waiting.popleft())
         if self._jobs is not None:
             yield from self._jobs.rest()
+        self.order = TemporalNeighbours()
 
     def said(
         self, frame: Answered, order: TemporalNeighbours | None = None
@@ -147,6 +151,8 @@ class VideoSegmenter:
         yield from self._jobs.do(partial(self._decided, frame, self.order.as_it_is()))
 
     def _decided(self, frame: Answered, order: TemporalNeighbours) -> tuple[int, SegmentedMask | None]:
+        if self._due is not None and frame.index not in self._due:
+            return frame.index, None
         asked = self.said(frame, order)
         if asked is None:
             return frame.index, None

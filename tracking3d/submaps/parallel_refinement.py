@@ -88,14 +88,13 @@ def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
         move_refined_estimates(first.folder, session, [look.out for look in job.looks], job.seconds)
     estimates = _estimates(first.folder, session.camera)
     most = session.config.object.adjustment_views
-    last = RefinementSteps(
-        estimates, GlobalAdjustment(session.result(), session.camera, sorted(estimates.causal), most)
-    )
+    look = GlobalAdjustment(session.result(), session.camera, sorted(estimates.causal), most)
+    last = RefinementSteps(estimates, look)
     for frame in _frames(first.source, first.whole, estimates):
         last.collect(frame)
     with share_threads(cv2.getNumThreads()):
         last.adjust_all()
-    return last.look
+    return look
 
 
 def adjust_poses(tell: Tell, job: Placing) -> list[FrameRecord]:

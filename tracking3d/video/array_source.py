@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator, Sized
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -47,6 +47,18 @@ class ArraySource:
         """Number of selected frames, if the iterable tells its length."""
         length = len(self.images) if isinstance(self.images, Sized) else getattr(self.images, "count", None)
         return len(within(self.selection, length)) if isinstance(length, int) else None
+
+    @property
+    def indices(self) -> Collection[int] | None:
+        """Indices of the frames, if the iterable tells its length; items may have indices of their own."""
+        if isinstance(self.images, list | tuple) and self.convert is not None:
+            wanted = self.images[self.selection.start : self.selection.stop : self.selection.step]
+            own = [item.index for item in wanted if isinstance(item, Frame | SkippedFrame)]
+            if own:
+                return frozenset(own) if len(own) == len(wanted) else None
+        if not isinstance(self.images, Sized):
+            return None if self.selection == EVERY_FRAME else self.selection
+        return within(self.selection, len(self.images))
 
     @property
     def repeatable(self) -> bool:

@@ -97,6 +97,11 @@ class CapturedFrames:
         )
 
     @property
+    def indices(self) -> range | None:
+        """Indices of the frames, if it is one of a file."""
+        return None if self.count is None else range(self.count)
+
+    @property
     def repeatable(self) -> bool:
         """Whether it is one of a file."""
         return self.count is not None

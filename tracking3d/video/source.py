@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Protocol, runtime_checkable
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame, pixels
+from tracking3d.video.selection import EVERY_FRAME
 
 Intrinsics = tuple[float, float, float, float]
 """``(fx, fy, cx, cy)`` in pixels of the full frame; pixel (0, 0) is the centre of the top-left pixel."""
@@ -58,6 +59,20 @@ class FrameSource(Protocol):
 def source_notes(source: FrameSource) -> tuple[str, ...]:
     """What a source did to its pictures, in clauses; sources that do nothing need not say so."""
     return tuple(getattr(source, "notes", ()))
+
+
+def known_indices(source: FrameSource) -> Collection[int] | None:
+    """Indices of the frames that a source will give; None if it does not know them before its end.
+
+    A source knows them by its attributes ``selection`` and ``count``, unless it has an attribute ``indices``.
+    """
+    if hasattr(source, "indices"):
+        indices: Collection[int] | None = source.indices
+        return indices
+    selection: range | None = getattr(source, "selection", None)
+    if selection is None or (source.count is None and selection.stop == EVERY_FRAME.stop):
+        return None
+    return selection if source.count is None else selection[: source.count]
 
 
 def check_frames(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:

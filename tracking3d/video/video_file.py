@@ -33,6 +33,7 @@ class VideoFile:
         path: Where it lies.
         interlaced: Whether its first picture is interlaced.
         notes: What was done to the pictures, in clauses.
+        counted: Whether the header states how many frames there are; else ``count`` comes from duration and rate.
     """
 
     name: str
@@ -45,6 +46,14 @@ class VideoFile:
     repeatable: bool = True
     interlaced: bool = False
     notes: tuple[str, ...] = ()
+    counted: bool = False
+
+    @property
+    def indices(self) -> range | None:
+        """Indices of the selected frames, if the header states how many frames there are or the selection ends."""
+        if self.counted and self.count is not None:
+            return self.selection[: self.count]
+        return None if self.selection.stop == EVERY_FRAME.stop else self.selection
 
     @classmethod
     def open(cls, name: str, path: Path, selection: range = EVERY_FRAME) -> VideoFile:
@@ -113,6 +122,7 @@ def describe_video(container: InputContainer, name: str, path: Path, selection: 
         float(rate) / selection.step if rate else None,
         interlaced=first is not None and first.interlaced_frame,
         notes=() if first is None else said_of(first),
+        counted=stream.frames > 0,
     )
 
 

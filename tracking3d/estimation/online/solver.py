@@ -45,8 +45,8 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     is_reliable,
     masks_overlap,
 )
+from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.frame_tracker import FrameTracker
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
@@ -67,6 +67,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import (
+    TRAJECTORY_LENGTH,
     advance,
     extrapolate_motion,
     pose_predictions,
@@ -86,12 +87,11 @@ from tracking3d.runtime.stage_times import in_stage
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
-_TRAJECTORY_LENGTH = 5  # tracked frames that the motion model extrapolates from
 
 
 @dataclass(frozen=True)
-class OnlineSolver(FrameTracker):
-    """The solver `online`; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `GuidedSolver`."""
+class OnlineSolver(ContinuedRefinement):
+    """The solver `online`; implements all protocols of `tracking3d.estimation.solver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """The classes that a `SolverState` consists of, for checkpoints."""
@@ -205,7 +205,7 @@ class OnlineSolver(FrameTracker):
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
         if not found.lost:
             updated = replace(
-                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-_TRAJECTORY_LENGTH:]
+                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-TRAJECTORY_LENGTH:]
             )
         if found.lost:  # no better pose than the causal one was found
             found = replace(found, fit=replace(found.fit, pose=causal))
@@ -274,7 +274,7 @@ class OnlineSolver(FrameTracker):
             revised.append(make_estimate(updated, earlier, found))
             updated = learn_colours(updated, revised[-1], found)
         updated = replace(
-            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAJECTORY_LENGTH:]),
+            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]),
             baseline=usual, tracked_points=view.points,
         )  # fmt: skip
         estimate = replace(revised[-1], revised=tuple(revised[:-1]))
@@ -315,7 +315,7 @@ class OnlineSolver(FrameTracker):
             updated = replace(updated, previous_pose=None)
         elif usual:
             updated = replace(
-                updated, trajectory=(*updated.trajectory, (pose, frame.index))[-_TRAJECTORY_LENGTH:]
+                updated, trajectory=(*updated.trajectory, (pose, frame.index))[-TRAJECTORY_LENGTH:]
             )
         found = replace(found, fit=replace(found.fit, pose=pose))
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated

@@ -204,21 +204,23 @@ def refine_map(
     scale: float = 1.0,
     bundle_iterations: int = 10,
     rounds: int = 1,
+    fixed: int = 1,
 ) -> ObjectMap:
     """Refine poses and landmarks by bundle adjustment, then the shape by outlines and landmarks, then the texture.
 
     Args:
         object_map: The map.
         camera: The camera of the full frame.
-        positions: Positions of the keyframes to refine, ascending; the first one's pose is fixed.
+        positions: Positions of the keyframes to refine; the poses of the first ``fixed`` are held.
         weights: The weights of the shape's terms.
         prior: Cost of a landmark at distance 1 from the surface, see
             `tracking3d.bundle_adjustment.adjustment.adjust`.
         scale: Scale in pixels of the robust loss.
         bundle_iterations: Iterations of the bundle adjustment.
         rounds: Rounds of the shape fit.
+        fixed: How many of the first keyframes keep their poses.
     """
-    object_map = _adjust_bundle(object_map, camera, positions, prior, scale, bundle_iterations)
+    object_map = _adjust_bundle(object_map, camera, positions, prior, scale, bundle_iterations, fixed)
     object_map = fit_shape(object_map, positions, weights, rounds)
     keyframes = list(object_map.keyframes)
     for position in positions:
@@ -228,7 +230,13 @@ def refine_map(
 
 
 def _adjust_bundle(
-    object_map: ObjectMap, camera: Camera, positions: list[int], prior: float, scale: float, iterations: int
+    object_map: ObjectMap,
+    camera: Camera,
+    positions: list[int],
+    prior: float,
+    scale: float,
+    iterations: int,
+    fixed: int,
 ) -> ObjectMap:
     views = [object_map.keyframes[position] for position in positions]
     names = shared_landmarks(object_map, views)
@@ -237,7 +245,7 @@ def _adjust_bundle(
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     places = surface_places(object_map, camera, views, names)
     found = adjust(
-        tracks, camera.K, start, fixed=1, scale=scale, iterations=iterations,
+        tracks, camera.K, start, fixed=fixed, scale=scale, iterations=iterations,
         point_prior=places, point_prior_weight=prior,
     )  # fmt: skip
     landmarks = object_map.landmarks.copy()

@@ -82,6 +82,8 @@ def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[
     )
 
 
+TRAJECTORY_LENGTH = 5
+"""Tracked frames that are extrapolated from."""
 _MAX_EXTRAPOLATION = 12  # frames
 
 
