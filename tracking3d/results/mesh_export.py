@@ -26,8 +26,9 @@ from trimesh.exchange.obj import export_obj
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
-from tracking3d.results.files import image_file, write_atomic
+from tracking3d.results.files import image_file, write_together
 from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
+from tracking3d.runtime.interruption import interrupts_deferred
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
@@ -36,15 +37,21 @@ _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
 def export_mesh(folder: Path, model: ObjectModel) -> None:
-    """Write the mesh files of a run.
+    """Write the mesh files of a run: all of them, or none if one cannot be written or the program is interrupted.
 
     Raises:
         OutputError: If one cannot be written.
     """
     texture = _Texture(model)
-    for name, data in obj_files(model, "object coordinates, OpenCV axes, arbitrary unit", texture).items():
-        write_atomic(folder / name, data)
-    write_atomic(folder / GLB, glb_file(model, texture=texture))
+    files = obj_files(model, "object coordinates, OpenCV axes, arbitrary unit", texture)
+    files[GLB] = glb_file(model, texture=texture)
+    files[FEATURES] = _features_file(model)
+    with interrupts_deferred():
+        write_together({folder / name: data for name, data in files.items()})
+
+
+def _features_file(model: ObjectModel) -> bytes:
+    """The exact model, without its texture image."""
     exact = io.BytesIO()
     seen: dict[str, Any] = {} if model.seen is None else {"seen": model.seen}
     np.savez_compressed(
@@ -56,7 +63,7 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
         features=model.features,
         **seen,
     )
-    write_atomic(folder / FEATURES, exact.getvalue())
+    return exact.getvalue()
 
 
 class _Texture:
@@ -91,14 +98,15 @@ def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) 
         specular=(0, 0, 0),
         name=Path(TEXTURE).stem,
     )
-    text, files = export_obj(
-        split_mesh(model, simple),
-        include_normals=True,
-        return_texture=True,
-        digits=9,
-        mtl_name=MTL,
-        header=f"tracking3d: {header}",
-    )
+    with interrupts_deferred():  # trimesh would catch them, and leave out normals or texture instead
+        text, files = export_obj(
+            split_mesh(model, simple),
+            include_normals=True,
+            return_texture=True,
+            digits=9,
+            mtl_name=MTL,
+            header=f"tracking3d: {header}",
+        )
     return {OBJ: text.encode(), **files}
 
 
@@ -128,9 +136,10 @@ def glb_file(
         if finish is not None:
             finish(tree)
 
-    data: bytes = export_glb(
-        split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
-    )
+    with interrupts_deferred():  # see `obj_files`
+        data: bytes = export_glb(
+            split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
+        )
     return data
 
 

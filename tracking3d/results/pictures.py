@@ -80,6 +80,11 @@ class Pictures:
         )
         self.add(frame, estimate, record)
 
+    @property
+    def any(self) -> bool:
+        """Whether a frame was drawn."""
+        return bool(self._thumbnails.kept)
+
     def close(self) -> None:
         """Finish the video.
 
