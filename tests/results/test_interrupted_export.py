@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while a mesh is exported: heard, though trimesh catches `BaseException`; no set of files is torn."""
+"""Ctrl-C and SIGTERM while a mesh is exported are heard, though trimesh catches `BaseException`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ MOMENTS = {
 }
 
 
-@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+@pytest.mark.parametrize(
+    ("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+)
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_a_signal_while_a_mesh_is_exported_is_heard(
     tmp_path, monkeypatch, sigterm_raises, moment, number, error
@@ -120,5 +122,3 @@ def test_a_run_that_is_interrupted_while_it_ends_says_so(tmp_path, monkeypatch, 
     with pytest.raises(KeyboardInterrupt):
         writer.finish(turning_sphere.model, "finished")
     assert RunReader(tmp_path).description["state"] == "interrupted"
-
-

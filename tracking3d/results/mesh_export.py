@@ -12,7 +12,7 @@ texel at the two poles mixes with the opposite edge.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,7 +26,7 @@ from trimesh.exchange.obj import export_obj
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
-from tracking3d.results.files import image_file, write_together
+from tracking3d.results.files import image_file, write_atomic, write_together
 from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 from tracking3d.runtime.interruption import interrupts_deferred
 
@@ -37,15 +37,25 @@ _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
 def export_mesh(folder: Path, model: ObjectModel) -> None:
-    """Write the mesh files of a run: all of them, or none if one cannot be written or the program is interrupted.
+    """Write the mesh files of a run: all of them, or none if the program is interrupted.
+
+    If one cannot be made, those before it are written nevertheless.
 
     Raises:
         OutputError: If one cannot be written.
     """
     texture = _Texture(model)
     files = obj_files(model, "object coordinates, OpenCV axes, arbitrary unit", texture)
-    files[GLB] = glb_file(model, texture=texture)
-    files[FEATURES] = _features_file(model)
+    try:
+        files[GLB] = glb_file(model, texture=texture)
+        files[FEATURES] = _features_file(model)
+    except Exception:
+        _write_files(folder, files)
+        raise
+    _write_files(folder, files)
+
+
+def _write_files(folder: Path, files: Mapping[str, bytes]) -> None:
     with interrupts_deferred():
         write_together({folder / name: data for name, data in files.items()})
 
@@ -210,13 +220,38 @@ def load_model(folder: Path) -> ObjectModel:
     """
     path = _existing(folder / FEATURES)
     try:
-        with np.load(path) as arrays, PillowImage.open(folder / TEXTURE) as image:
+        # From memory: numpy leaves a damaged file open.
+        with (
+            np.load(io.BytesIO(path.read_bytes())) as arrays,
+            PillowImage.open(folder / TEXTURE) as image,
+        ):
             texture: NDArray[np.uint8] = np.asarray(image.convert("RGB"))
             return ObjectModel(texture=texture, **{name: arrays[name] for name in arrays.files})
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(
             f"The model {path} cannot be read ({error}); track again into another {OUT}."
         ) from error
+
+
+def restore_texture(folder: Path) -> bool:
+    """If the texture image of a run is missing, take it from the GLB, if that has it.
+
+    Returns:
+        Whether that was done.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    path = folder / TEXTURE
+    if (path.is_file() and path.stat().st_size) or not (folder / GLB).is_file():
+        return False
+    try:
+        mesh: Any = trimesh.load(folder / GLB, force="mesh", process=False)
+        image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"), dtype=np.uint8)
+    except Exception:  # the GLB is damaged too
+        return False
+    write_atomic(path, image_file(image))
+    return True
 
 
 def _existing(path: Path) -> Path:
