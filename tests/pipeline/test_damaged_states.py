@@ -380,3 +380,18 @@ def test_a_mask_that_was_fed_back_to_the_tracker_has_to_be_whole(
     (folder / layout.STATE / layout.MASKS / "000004.png").unlink()
     record(open_source(str(images)), config, folder, mask=clip.masks[0], resume=True)
     assert_alike(folder, tmp_path / "whole")
+
+
+def test_a_shape_that_was_interrupted_is_reconstructed_when_the_run_is_resumed(
+    tmp_path, clip, images, monkeypatch
+):
+    def stop(*_):
+        raise Stopped
+
+    folder, config = tmp_path / "run", settings("object.shape=fine")
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr("tracking3d.reconstruction.final_shape.rebuild_shape", stop)
+        record(open_source(str(images)), config, folder, mask=clip.masks[0])
+    assert RunReader(folder).state == "finished" and "shape" not in RunReader(folder).description
+    record(open_source(str(images)), config, folder, mask=clip.masks[0], resume=True)
+    assert RunReader(folder).description["shape"]

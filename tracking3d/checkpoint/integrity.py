@@ -22,17 +22,6 @@ from tracking3d.results.run_reader import LONGEST_LINE, RunReader
 from tracking3d.video.opencv_log import silent_opencv
 
 
-@dataclass(frozen=True)
-class Damage:
-    """The first damage that was found in a run.
-
-    Attributes:
-        what: What is damaged, as the beginning of a sentence.
-    """
-
-    what: str
-
-
 @dataclass(frozen=True, eq=False)
 class WholeLines:
     """The lines of a ``frames.jsonl`` up to the first that is damaged.
@@ -91,8 +80,8 @@ class RunIntegrity:
         self.lines = WholeLines.of(folder / layout.FRAMES)
         self._areas: dict[Path, int | None] = {}
 
-    def of_state(self, progress: RunProgress, taken: Mapping[int, JournalEntry]) -> Damage | None:
-        """The damage to the estimates that a saved state rests on; None if they are whole.
+    def of_state(self, progress: RunProgress, taken: Mapping[int, JournalEntry]) -> str:
+        """What is damaged of the estimates that a saved state rests on, in words; empty if they are whole.
 
         Args:
             progress: The progress of that state.
@@ -102,7 +91,7 @@ class RunIntegrity:
             return damage
         causal = latest(self.lines.until(progress.lines), refined=False)
         if lost := sorted(taken.keys() - {record.index for record in causal}):
-            return Damage(f"{layout.FRAMES} lacks frame {lost[0]}")
+            return f"{layout.FRAMES} lacks frame {lost[0]}"
         corrections = [
             layout.mask_path(self._folder / layout.STATE, one.index)
             for one in taken.values()
@@ -111,11 +100,11 @@ class RunIntegrity:
         return (
             self._of_causal(causal)
             or self._first_damage((path, self._area(path) is not None) for path in corrections)
-            or (self._of_refinement(progress) if progress.refining else None)
+            or (self._of_refinement(progress) if progress.refining else "")
         )
 
-    def of_finished(self, run: RunReader) -> Damage | None:
-        """The damage to the estimates and the model of a finished run; None if they are whole."""
+    def of_finished(self, run: RunReader) -> str:
+        """What is damaged of the estimates and the model of a finished run, in words; empty if they are whole."""
         if damage := _too_short(layout.FRAMES, self.lines, self.lines.size):
             return damage
         final = latest(self.lines.records)
@@ -123,15 +112,15 @@ class RunIntegrity:
         for key, name, found in (("counts", "frames", final), ("refinement", "refined frames", refined)):
             number = (run.description.get(key) or {}).get("frames")
             if isinstance(number, int) and len(found) < number:
-                return Damage(f"{layout.FRAMES} has {len(found)} of {number} {name}")
+                return f"{layout.FRAMES} has {len(found)} of {number} {name}"
         return (
             self._of_causal(latest(self.lines.records, refined=False))
             or self._first_damage(self._of_masks(self._folder, refined))
             or self._of_model(self._folder)
         )
 
-    def _of_causal(self, records: Sequence[FrameRecord]) -> Damage | None:
-        """The damage to the masks of causal estimates, and to the initial masks."""
+    def _of_causal(self, records: Sequence[FrameRecord]) -> str:
+        """The first damaged mask of causal estimates, or initial mask."""
         causal, masks = self._folder / layout.CAUSAL, list[tuple[Path, bool]]()
         for record in records:
             aside = layout.mask_path(causal, record.index)
@@ -141,21 +130,17 @@ class RunIntegrity:
                 masks.append((initial, self._area(initial) is not None))
         return self._first_damage(masks)
 
-    def _of_refinement(self, progress: RunProgress) -> Damage | None:
-        """The damage to what a final refinement has made so far; it may have been stopped while it took over."""
+    def _of_refinement(self, progress: RunProgress) -> str:
+        """What is damaged of a final refinement so far; it may have been stopped while its masks were moved."""
         aside, causal = self._folder / layout.REFINING, self._folder / layout.CAUSAL
         lines = WholeLines.of(aside / layout.FRAMES)
         if damage := _too_short(f"{layout.REFINING}/{layout.FRAMES}", lines, progress.refined_lines):
             return damage
-        refined = latest(lines.until(progress.refined_lines))
-        moved = [
-            record
-            for record in refined
-            if layout.mask_path(causal, record.index).is_file()
-            and not layout.mask_path(aside, record.index).is_file()
-        ]
-        there = [record for record in refined if record not in moved]
-        masks = (*self._of_masks(aside, there), *self._of_masks(self._folder, moved))
+        masks = list[tuple[Path, bool]]()
+        for record in latest(lines.until(progress.refined_lines)):
+            replaced = layout.mask_path(causal, record.index).is_file()
+            moved = replaced and not layout.mask_path(aside, record.index).is_file()
+            masks += self._of_masks(self._folder if moved else aside, [record])
         model = causal if (causal / layout.FEATURES).is_file() else self._folder
         return self._first_damage(masks) or self._of_model(model)
 
@@ -165,18 +150,18 @@ class RunIntegrity:
             path = layout.mask_path(folder, record.index)
             yield path, self._area(path) == record.area
 
-    def _of_model(self, folder: Path) -> Damage | None:
+    def _of_model(self, folder: Path) -> str:
         try:
             load_model(folder)
         except InputError:
-            return Damage(f"{layout.FEATURES} or {layout.TEXTURE} is missing or damaged")
-        return None
+            return f"{layout.FEATURES} or {layout.TEXTURE} is missing or damaged"
+        return ""
 
-    def _first_damage(self, files: Iterable[tuple[Path, bool]]) -> Damage | None:
+    def _first_damage(self, files: Iterable[tuple[Path, bool]]) -> str:
         for path, whole in files:
             if not whole:
-                return Damage(f"{path.relative_to(self._folder)} is missing or damaged")
-        return None
+                return f"{path.relative_to(self._folder)} is missing or damaged"
+        return ""
 
     def _area(self, path: Path) -> int | None:
         """Pixels of a mask; None if there is none that can be decoded."""
@@ -187,9 +172,9 @@ class RunIntegrity:
         return self._areas[path]
 
 
-def _too_short(name: str, lines: WholeLines, needed: int) -> Damage | None:
-    """The damage if a file has fewer bytes of whole lines than are needed."""
+def _too_short(name: str, lines: WholeLines, needed: int) -> str:
+    """What to say if a file has fewer bytes of whole lines than are needed."""
     if lines.end >= needed:
-        return None
+        return ""
     what = "is shorter than it was" if lines.size < needed else "is damaged"
-    return Damage(f"{name} {what}")
+    return f"{name} {what}"

@@ -44,11 +44,11 @@ def read_intact_state(folder: Path, checkpoint: Checkpoint) -> SavedState | None
             unreadable, why = unreadable or error, why or f"{layout.STATE}/{name} is damaged"
             continue
         damage = integrity.of_state(kept.progress, kept.taken)
-        if damage is None:
+        if not damage:
             if why:
                 _return_to(folder, checkpoint, name, kept, why)
             return kept
-        why = why or damage.what
+        why = why or damage
     if unreadable is not None:
         raise unreadable
     _log.warning("%s: %s, and no state from before that is saved; the run begins again.", folder, why)

@@ -42,7 +42,7 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
             taken, _ = read_journal(journal)
             progress = RunProgress(**state["progress"])
-            whole = integrity.of_state(progress, taken) is None
+            whole = not integrity.of_state(progress, taken)
         except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
             whole = False
         if whole and not taken.keys() & set(changed):

@@ -36,9 +36,11 @@ def model(
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --quality fine reconstruct its shape too.
 
-    `tracking3d run` does this at its end; its option --model chooses how.
+    `tracking3d run` does this at its end; its option --model chooses how. The run's contact sheet, report and
+    turntable are made again, if it has them.
     """
     from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
+    from tracking3d.report.renewal import renew_report
 
     if quality is ModelQuality.FINE:
         shaped = rebuild_shape(run, source, views, largest)
@@ -48,6 +50,8 @@ def model(
         made, taken = retexture_run(run, source, views, largest)
     size = len(made.texture)
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
+    for path in renew_report(run):
+        typer.echo(path)
 
 
 def check_fine(source: str) -> None:

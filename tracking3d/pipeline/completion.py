@@ -31,13 +31,13 @@ def is_intact(folder: Path) -> bool:
     if restore_texture(folder):
         _log.warning(_MADE_AGAIN, folder, layout.TEXTURE)
     damage = RunIntegrity(folder).of_finished(RunReader(folder))
-    if damage is not None:
+    if damage:
         _log.warning(
             "%s: %s; what depends on it is computed again, and until then the run stays as it is.",
             folder,
-            damage.what,
+            damage,
         )
-    return damage is None
+    return not damage
 
 
 def complete_run(folder: Path, config: PipelineConfig, source: FrameSource) -> None:

@@ -9,6 +9,7 @@ from tracking3d.errors import OutputError
 from tracking3d.results import layout
 
 PICTURES = (layout.OVERLAY, layout.CONTACT_SHEET)
+_SHOWN = (layout.RUN, layout.FRAMES, *PICTURES, *layout.MESH_FILES)
 
 
 def missing_files(folder: Path, names: Iterable[str]) -> list[str]:
@@ -33,6 +34,18 @@ def check_complete(folder: Path, *, mesh: bool, pictures: bool) -> None:
         raise OutputError(
             f"{', '.join(missing)} {verb} missing in {folder}, so that the run is not finished; resume it."
         )
+
+
+def lacks_report(folder: Path) -> bool:
+    """Whether a run has no report, or no turntable though it has a model."""
+    model = (folder / layout.FEATURES).is_file()
+    return bool(missing_files(folder, (layout.REPORT, *([layout.TURNTABLE] if model else []))))
+
+
+def times_written(folder: Path) -> tuple[int, ...]:
+    """When the files were written that a report shows; if one of them changes, the report is out of date."""
+    paths = [folder / name for name in _SHOWN]
+    return tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in paths)
 
 
 def _is_there(path: Path) -> bool:
