@@ -287,7 +287,7 @@ def test_milestones_that_are_too_large_go(clip, images, tmp_path, monkeypatch, c
     stepped.clear()
     correct_run(tmp_path / "run", told(clip))
     assert stepped == list(range(FRAMES))
-    assert "No state of before frame 6 was kept" in caplog.text
+    assert "No checkpoint before frame 6 is saved" in caplog.text
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
