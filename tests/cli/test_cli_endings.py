@@ -98,7 +98,7 @@ def test_a_signal_while_the_mesh_is_written_ends_the_run_and_resume_finishes_it(
     command = ("run", clip, "--box", "20,10,20,20", "--out", "run")
     result = call(*command)
     assert result.exit_code == program.INTERRUPTED
-    assert result.stderr.splitlines()[-2] == "interrupted"
+    assert "interrupted" in result.stderr.splitlines()
     assert RunReader(Path("run")).state == "interrupted"
     assert call(*command, "--resume").exit_code == 0
     assert RunReader(Path("run")).state == "finished"

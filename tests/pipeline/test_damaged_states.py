@@ -16,6 +16,7 @@ from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import Stopped, assert_alike, settings, stop_at
 
 from tracking3d.errors import InputError
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.results import layout
@@ -395,3 +396,23 @@ def test_a_shape_that_was_interrupted_is_reconstructed_when_the_run_is_resumed(
     assert RunReader(folder).state == "finished" and "shape" not in RunReader(folder).description
     record(open_source(str(images)), config, folder, mask=clip.masks[0], resume=True)
     assert RunReader(folder).description["shape"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("moment", "file"),
+    [
+        ((Session, "step", 6), layout.FRAMES),
+        ((Session, "refine_frame", 5), f"{layout.REFINING}/{layout.FRAMES}"),
+    ],
+    ids=["tracked", "refined"],
+)
+def test_the_online_solver_goes_back_to_the_same_estimates(tmp_path, clip, images, monkeypatch, moment, file):
+    monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
+    record(open_source(str(images)), settings(), tmp_path / "whole", mask=clip.masks[0])
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        stop_at(patch, *moment)
+        record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0])
+    cut(tmp_path / "run" / file, len(lines_of(tmp_path / "run" / file)) - 1, nul=500)
+    record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
+    assert_alike(tmp_path / "run", tmp_path / "whole")
