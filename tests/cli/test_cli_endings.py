@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from tracking3d.cli import program
+from tracking3d.results import layout
+from tracking3d.results.run_reader import RunReader
 
 PYTHON = [sys.executable, "-m", "tracking3d"]
 
@@ -74,6 +78,33 @@ def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
     assert kept == "The frames finished until then are in run."
     assert advice == "To continue from there, repeat the command with --resume."
     assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", [0, 1, 2])
+def test_a_signal_while_the_mesh_is_written_ends_the_run_and_resume_finishes_it(
+    call, clip, script, monkeypatch, number, moment
+):
+    """trimesh, which writes vertices, normals and texture coordinates by this function, catches `BaseException`."""
+    calls, function = [], trimesh.util.array_to_string
+
+    def signalling(*given, **named):
+        calls.append(0)
+        if len(calls) == moment + 1:
+            signal.raise_signal(number)
+        return function(*given, **named)
+
+    monkeypatch.setattr(trimesh.util, "array_to_string", signalling)
+    command = ("run", clip, "--box", "20,10,20,20", "--out", "run")
+    result = call(*command)
+    assert result.exit_code == program.INTERRUPTED
+    assert "interrupted" in result.stderr.splitlines()
+    assert RunReader(Path("run")).state == "interrupted"
+    assert call(*command, "--resume").exit_code == 0
+    assert RunReader(Path("run")).state == "finished"
+    assert not {*layout.MESH_FILES, layout.OVERLAY, layout.CONTACT_SHEET, layout.REPORT} - {
+        path.name for path in Path("run").iterdir()
+    }
 
 
 @pytest.mark.parametrize(

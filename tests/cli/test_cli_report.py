@@ -40,19 +40,55 @@ def test_a_run_that_does_not_come_to_its_end_has_a_report_that_says_so(
 
 
 @pytest.mark.parametrize(
-    "fault",
-    [OutputError("The disk is full."), RuntimeError("a fault"), ImportError("no Jinja"), KeyboardInterrupt()],
+    ("fault", "code"),
+    [
+        (OutputError("The disk is full."), 0),
+        (RuntimeError("a fault"), 0),
+        (ImportError("no Jinja"), 0),
+        (KeyboardInterrupt(), 130),
+    ],
 )
-def test_a_report_that_fails_takes_nothing_from_the_run(call, clip, script, monkeypatch, fault):
+def test_a_report_that_fails_takes_nothing_from_the_run(call, clip, script, monkeypatch, fault, code):
     def fail(*_):
         raise fault
 
     monkeypatch.setattr("tracking3d.report.several.write_reports", fail)
     result = call("run", clip, *BOX)
-    assert result.exit_code == 0
+    assert result.exit_code == code
     assert RunReader(RUN).state == "finished"
     [said] = [line for line in result.stderr.splitlines() if "report" in line]
     assert "Try again with `tracking3d report`" in said
+
+
+def test_a_finished_run_that_was_killed_before_its_report_gets_one(call, clip, script):
+    call("run", clip, *BOX, "--no-report")
+    result = call("run", clip, *BOX, "--resume")
+    assert result.exit_code == 0
+    assert (RUN / "report.html").is_file()
+    (RUN / "report.html").unlink()
+    assert call("run", clip, *BOX, "--resume", "--no-report").exit_code == 0
+    assert not (RUN / "report.html").exists()
+
+
+def test_a_finished_run_that_lacks_a_file_gets_it_and_another_report(call, clip, script):
+    call("run", clip, *BOX)
+    (RUN / "contact_sheet.png").unlink()
+    (RUN / "turntable.mp4").touch()
+    (RUN / "report.html").write_text("out of date")
+    result = call("run", clip, *BOX, "--resume")
+    assert result.exit_code == 0
+    assert (RUN / "contact_sheet.png").is_file()
+    assert "nothing to resume" not in result.stdout
+    assert "Frame by frame" in (RUN / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_run_of_which_nothing_is_missing_keeps_its_report(call, clip, script):
+    call("run", clip, *BOX)
+    (RUN / "turntable.mp4").write_bytes(b"there")
+    (RUN / "report.html").write_text("as it was")
+    result = call("run", clip, *BOX, "--resume")
+    assert "nothing to resume" in result.stdout
+    assert (RUN / "report.html").read_text() == "as it was"
 
 
 def test_a_run_that_is_refused_leaves_the_report_of_the_earlier_one(call, clip, script):

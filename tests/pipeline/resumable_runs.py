@@ -7,12 +7,45 @@ from pathlib import Path
 
 import numpy as np
 
+from tracking3d import load_config
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader, read_records
 
 POSE = 1e-5
 """By which poses may differ from those of a run that was not stopped."""
+
+
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C at a chosen moment."""
+
+
+def settings(*overrides: str):
+    quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
+    return load_config(
+        overrides=[
+            *quick,
+            "crop.size=32",
+            "object.frequency=2",
+            "object.texture_size=32",
+            "camera.fov=45",
+            *overrides,
+        ],
+        runtime={"on_plugin_failure": "stop"},
+    )
+
+
+def stop_at(monkeypatch, owner, name: str, call: int, error: BaseException | None = None) -> None:
+    """Raise at the ``call``-th call, counted from 0."""
+    method, calls = getattr(owner, name), []
+
+    def stopping(self, *given, **named):
+        calls.append(name)
+        if len(calls) == call + 1:
+            raise error or Stopped()
+        return method(self, *given, **named)
+
+    monkeypatch.setattr(owner, name, stopping)
 
 
 def assert_alike(resumed: Path, whole: Path) -> None:

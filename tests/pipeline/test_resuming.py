@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
-from resumable_runs import assert_alike, files_of
+from resumable_runs import Stopped, assert_alike, files_of, settings, stop_at
 
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
@@ -32,10 +32,6 @@ from tracking3d.trackers.flow import FlowTracker
 from tracking3d.video import open_source
 
 FRAMES = 6
-
-
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C at a chosen moment."""
 
 
 @pytest.fixture(scope="module")
@@ -65,21 +61,6 @@ def online(monkeypatch) -> None:
     monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
 
 
-def settings(*overrides: str):
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
-    return load_config(
-        overrides=[
-            *quick,
-            "crop.size=32",
-            "object.frequency=2",
-            "object.texture_size=32",
-            "camera.fov=45",
-            *overrides,
-        ],
-        runtime={"on_plugin_failure": "stop"},
-    )
-
-
 @pytest.fixture(scope="module")
 def whole(clip, images, tmp_path_factory) -> dict[str, Path]:
     """Runs that nobody stopped, by solver."""
@@ -90,19 +71,6 @@ def whole(clip, images, tmp_path_factory) -> dict[str, Path]:
             runs[name] = tmp_path_factory.mktemp("whole") / name
             record(open_source(str(images)), settings(), runs[name], mask=clip.masks[0])
     return runs
-
-
-def stop_at(monkeypatch, owner, name: str, call: int, error: BaseException | None = None) -> None:
-    """Raise at the ``call``-th call, counted from 0."""
-    method, calls = getattr(owner, name), []
-
-    def stopping(self, *given, **named):
-        calls.append(name)
-        if len(calls) == call + 1:
-            raise error or Stopped()
-        return method(self, *given, **named)
-
-    monkeypatch.setattr(owner, name, stopping)
 
 
 def stopped(monkeypatch, clip, images, folder, owner, name, call, error=None) -> None:

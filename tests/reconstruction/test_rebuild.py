@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rendered_views import CAMERA, SIDE, ball, pattern, pose, seen
@@ -19,6 +20,8 @@ from tracking3d.frames import Frame
 from tracking3d.reconstruction import rebuild
 from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
 from tracking3d.reconstruction.shape import ReconstructedShape
+from tracking3d.report import turntable
+from tracking3d.report.run_report import write_report
 from tracking3d.results.description import RunHeader
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
@@ -98,6 +101,66 @@ def test_the_command_says_what_it_did(tmp_path):
     assert "texture of 128 x 128 texels from 3 frames" in result.output.replace("\n", "")
     assert len(load_model(run).texture) == 128
     assert CliRunner().invoke(app, ["model", str(tmp_path / "absent")]).exit_code == 2
+
+
+def sheet_of(run: Path) -> np.ndarray:
+    image = cv2.imread(str(run / "contact_sheet.png"))
+    assert image is not None
+    return image
+
+
+def new_shape(monkeypatch) -> None:
+    """Let the reconstruction find a sphere of half the size."""
+    made = ReconstructedShape(ball().vertices * 0.5, ball().faces, "it is better", None, None)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda vertices, faces, views, left_out: made)
+
+
+@pytest.mark.parametrize(
+    "has",
+    [["report.html", "turntable.mp4"], ["report.html"], ["turntable.mp4"], []],
+    ids=lambda has: " and ".join(has) or "neither",
+)
+def test_what_shows_the_mesh_is_made_again_if_the_run_has_it(tmp_path, monkeypatch, has):
+    monkeypatch.setattr(turntable, "VIEWS", 3)
+    run = written(tmp_path)
+    new_shape(monkeypatch)
+    if has:
+        write_report(run)
+    for name in {"report.html", "turntable.mp4"} - set(has):
+        (run / name).unlink(missing_ok=True)
+    before = {name: (run / name).read_bytes() for name in has}
+    result = CliRunner().invoke(app, ["model", str(run), "--quality", "fine"])
+    assert result.exit_code == 0, result.output
+    after = {name: (run / name).read_bytes() for name in has}
+    assert all(after[name] != before[name] for name in has)
+    assert {path.name for path in run.iterdir()} & {"report.html", "turntable.mp4"} == set(has)
+    assert all(name in result.output for name in has)
+
+
+def test_the_contact_sheet_shows_the_new_mesh_and_the_same_crops(tmp_path, monkeypatch):
+    run = written(tmp_path)
+    new_shape(monkeypatch)
+    before = sheet_of(run)
+    rebuild_shape(run)
+    after = sheet_of(run)
+    tile = after.shape[1] // 6
+    assert before.shape[1] == after.shape[1]
+    crops = np.s_[:tile, : 3 * tile]  # three frames; then texture and model in the next row
+    assert np.abs(before[crops].astype(int) - after[crops]).mean() < 3
+    model = np.s_[tile : 2 * tile, tile : 2 * tile]
+    assert np.abs(before[model].astype(int) - after[model]).mean() > 5
+    (run / "contact_sheet.png").unlink()
+    retexture_run(run)
+    assert not (run / "contact_sheet.png").exists(), "a run without one does not get one"
+
+
+def test_the_notes_speak_of_the_new_mesh(tmp_path, monkeypatch):
+    run = written(tmp_path)
+    path = run / "run.json"
+    stale = "90 % of the mesh's surface was never seen; its shape there is a guess"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"notes": [stale]}))
+    retexture_run(run)
+    assert stale not in json.loads(path.read_text())["notes"]
 
 
 def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):

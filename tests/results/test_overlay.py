@@ -11,7 +11,15 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing
-from tracking3d.results.contact_sheet import COLUMNS, CROPS, MOST, TILE, Thumbnails, draw_contact_sheet
+from tracking3d.results.contact_sheet import (
+    COLUMNS,
+    CROPS,
+    MOST,
+    TILE,
+    Thumbnails,
+    crop_positions,
+    draw_contact_sheet,
+)
 from tracking3d.results.description import summary
 from tracking3d.results.overlay import ObjectAxes, OverlaySize, draw_overlay
 from tracking3d.results.records import FrameRecord
@@ -187,6 +195,7 @@ def test_thumbnails_are_few_and_spread_over_a_clip_of_any_length(turning_sphere)
         assert len(thumbnails.kept) <= MOST
         steps = np.diff([thumbnail.index for thumbnail in thumbnails.kept])
         assert len(set(steps)) <= 1
+        assert [thumbnail.index for thumbnail in thumbnails.kept] == list(crop_positions(index + 1))
     chosen = [thumbnail.index for thumbnail in thumbnails.spread(CROPS)]
     assert len(chosen) == CROPS
     assert chosen[0] == 0

@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from tracking3d.batch.video_job import VideoJob
-from tracking3d.report.frame_pictures import jpeg_of, overlay_frames
+from tracking3d.report.frame_pictures import jpeg_of
 from tracking3d.results import layout
 from tracking3d.results.description import now, time_per_frame
 from tracking3d.results.files import write_atomic
 from tracking3d.results.overlay import OverlaySize
+from tracking3d.results.redrawing import overlay_frames
 from tracking3d.results.run_reader import RunReader
 
 MARKER = "batch.json"

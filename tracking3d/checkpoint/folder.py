@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
+from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only, milestones_in
 from tracking3d.checkpoint.progress import JournalEntry, RunProgress, SavedState, journal_line, read_journal
 from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
+from tracking3d.results.run_reader import FormatError
 
 VERSION = 2
 MOST_KEPT = 200 * 10**6
@@ -96,19 +97,26 @@ class Checkpoint:
                 self._taken[taken.index] = len(self._taken) + 1
                 if self._milestones.due(count := len(self._taken)):
                     self._milestones.keep(self._folder / layout.STATE_FILE, count, self._trees.arrays)
+            if progress.refining and progress.last_refined < 0:
+                state = self._folder / layout.STATE_FILE
+                self._milestones.keep_refinement_start(state, len(self._taken), self._trees.arrays)
             self._trees.tidy(self._milestones.arrays)
 
-    def read(self) -> SavedState:
-        """Read the last saved state.
+    def read(self, name: str = layout.STATE_FILE) -> SavedState:
+        """Read the last saved state, or an earlier one.
+
+        Args:
+            name: The file of the state.
 
         Raises:
-            InputError: If it is damaged, or was written by another version.
+            InputError: If it is damaged.
+            FormatError: If it was written by another version.
         """
-        path = self._folder / layout.STATE_FILE
+        path = self._folder / name
         try:
             state = json.loads(path.read_bytes())
             if state["version"] != VERSION:
-                raise InputError(
+                raise FormatError(
                     f"{path} was written by another version of tracking3d (format {state['version']}); "
                     f"run it again with {layout.OVERWRITE}."
                 )
@@ -125,6 +133,21 @@ class Checkpoint:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
         return kept
+
+    def earlier_states(self) -> list[str]:
+        """File names of the states before the last one, for `read`; the latest first."""
+        start = self._folder / layout.REFINEMENT_START
+        earlier = [one.path.name for one in reversed(milestones_in(self._folder))]
+        return [*([start.name] if start.is_file() else []), *earlier]
+
+    def return_to(self, name: str) -> None:
+        """Let an earlier state take the place of the last one; what is newer is removed by `clear_strangers`.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        with writing(self._folder):
+            write_atomic(self._folder / layout.STATE_FILE, (self._folder / name).read_bytes())
 
     def clear_strangers(self) -> None:
         """Remove the files of a state that was not finished, after `read`.

@@ -53,18 +53,22 @@ class Milestones:
     def __init__(self, folder: Path, most: int) -> None:
         self._folder, self._most = folder, most
         self._kept: list[Milestone] = []
+        self._refinement: Milestone | None = None
         self._gap = _FIRST_GAP
 
     def read(self, taken: int) -> None:
         """Read those of a run that is resumed after so many frames; later ones are removed."""
         self._kept = milestones_in(self._folder)
         self.forget_after(taken)
+        start = self._folder / layout.REFINEMENT_START
+        self._refinement = _read_milestone(start, taken) if start.is_file() else None
         self._gap = math.gcd(*(one.taken for one in self._kept)) or _FIRST_GAP
 
     @property
     def arrays(self) -> frozenset[str]:
         """Names of the array files that any of them needs."""
-        return frozenset().union(*(one.arrays for one in self._kept))
+        kept = [*self._kept, *([self._refinement] if self._refinement else [])]
+        return frozenset().union(*(one.arrays for one in kept))
 
     def due(self, taken: int) -> bool:
         """Whether the state after so many frames is to be saved."""
@@ -88,6 +92,12 @@ class Milestones:
             self._gap *= 2
             self._drop([one for one in self._kept if one.taken % self._gap])
 
+    def keep_refinement_start(self, state: Path, taken: int, arrays: frozenset[str]) -> None:
+        """Keep the state as the final refinement begins, beside the rollback points; see `keep`."""
+        path = self._folder / layout.REFINEMENT_START
+        link_or_copy(state, path)
+        self._refinement = Milestone(taken, path, arrays)
+
     def forget_after(self, taken: int) -> None:
         """Remove those after so many frames, since an earlier estimate has changed.
 
@@ -107,9 +117,13 @@ def milestones_in(folder: Path) -> list[Milestone]:
     found = []
     for path in sorted(folder.glob("milestone_*.json")) if folder.is_dir() else ():
         if name := _NAME.fullmatch(path.name):
-            text = path.read_text(encoding="ascii", errors="replace")
-            found.append(Milestone(int(name[1]), path, frozenset(_ARRAYS.findall(text))))
+            found.append(_read_milestone(path, int(name[1])))
     return sorted(found, key=lambda one: one.taken)
+
+
+def _read_milestone(path: Path, taken: int) -> Milestone:
+    text = path.read_text(encoding="ascii", errors="replace")
+    return Milestone(taken, path, frozenset(_ARRAYS.findall(text)))
 
 
 def keep_milestones_only(folder: Path, most_bytes: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,12 @@ class RunProgress:
     refined_lines: int = 0
     seconds: float = 0.0
     refinement_seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value, kind = getattr(self, one.name), type(one.default)
+            if isinstance(value, bool) != (kind is bool) or not isinstance(value, int | kind):
+                raise TypeError(f"{one.name} is {value!r:.40}")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import ValidationError
 
+from tracking3d.checkpoint.integrity import WholeLines
 from tracking3d.checkpoint.progress import checksum
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, OutputError
@@ -103,7 +104,7 @@ def earlier_run(
         raise OutputError(f"{folder} is in use by another run; wait for it or choose another {layout.OUT}.")
     finished = run.state == "finished"
     if not finished and not layout.has_state(folder):
-        if len(run.frames) <= 1:  # stopped before the first state was saved
+        if len(_estimated(folder)) <= 1:  # stopped before the first state was saved
             return "none"
         raise InputError(
             f"The run {folder} cannot be resumed: its state was not saved; run it again with {layout.OVERWRITE}."
@@ -113,11 +114,15 @@ def earlier_run(
             f"The run {folder} cannot be resumed with other settings or another source: {what}; "
             f"use the same settings and source, or run it again with {layout.OVERWRITE}."
         )
-    if changed := _changed(run.description, given):
-        estimated = {record.index for record in run.frames}
-        if finished or changed & estimated:
-            return "outdated"
+    changed = _changed(run.description, given)
+    if changed and (finished or changed & _estimated(folder)):
+        return "outdated"
     return "finished" if finished else "stopped"
+
+
+def _estimated(folder: Path) -> set[int]:
+    """The frames that have an estimate in a run, up to a damaged line."""
+    return {record.index for record in WholeLines.of(folder / layout.FRAMES).records}
 
 
 def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:

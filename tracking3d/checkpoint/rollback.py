@@ -7,8 +7,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from tracking3d.checkpoint.integrity import RunIntegrity
 from tracking3d.checkpoint.milestones import Milestone, milestones_in
-from tracking3d.checkpoint.progress import read_journal
+from tracking3d.checkpoint.progress import RunProgress, read_journal
 from tracking3d.errors import InputError
 from tracking3d.results import layout
 from tracking3d.results.files import link_or_copy, write_atomic, writing
@@ -19,10 +20,12 @@ from tracking3d.results.run_reader import RunReader, read_records
 def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None:
     """Copy a run, rolled back to before the first of some frames, into an empty folder, as a stopped run.
 
+    What is copied is whole: if frames before then are damaged, the run is rolled back to before those.
+
     Args:
         folder: The run; nothing of it is changed.
         stage: Gets the earlier run: its last rollback point before then, and its estimates.
-        changed: Indices of those frames.
+        changed: Indices of those frames; none for the last rollback point.
 
     Returns:
         Number of frames estimated in it; None if no earlier state was saved, and nothing was copied.
@@ -32,17 +35,18 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
         InputError: If the run is damaged.
     """
     inner = folder / layout.STATE
-    milestones = milestones_in(inner)
+    milestones, integrity = milestones_in(inner), RunIntegrity(folder)
     while milestones:
         try:
             state = json.loads(milestones[-1].path.read_bytes())
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
             taken, _ = read_journal(journal)
-            lines = int(state["progress"]["lines"])
+            progress = RunProgress(**state["progress"])
+            whole = not integrity.of_state(progress, taken)
         except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
-            taken, journal, lines = {}, b"", -1
-        if lines >= 0 and not taken.keys() & set(changed):
-            _copy_run(folder, stage, milestones, journal, lines)
+            whole = False
+        if whole and not taken.keys() & set(changed):
+            _copy_run(folder, stage, milestones, journal, progress.lines)
             return len(taken)
         milestones.pop()
     return None

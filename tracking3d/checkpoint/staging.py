@@ -33,6 +33,8 @@ def stage_correction(
 ) -> tuple[Path, Earlier]:
     """The folder in which a corrected run is computed: from the last state before the correction, if one was saved.
 
+    A finished run that is damaged is computed again in the same way, from the last state of which all is whole.
+
     Args:
         folder: The run folder.
         config: See `tracking3d.checkpoint.resuming.earlier_run`.
@@ -57,17 +59,17 @@ def stage_correction(
         raise OutputError(f"{folder} is in use by another run; wait for it.")
     there = _earlier_correction(stage, config, selection, given)
     if there in ("stopped", "finished"):
-        _log.info("Continuing the correction that was stopped.")
+        _log.info("Continuing what was begun in %s.", stage)
         return stage, there
     remove_run(stage)
     changed = changed_frames(folder, given)
     estimated = roll_back(folder, stage, changed)
     if estimated is None:
         _log.warning(
-            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before "
-            "the correction get the estimates that they had.",
-            min(changed),
+            "No checkpoint%s is saved in %s, so that all frames are computed again%s.",
+            f" before frame {min(changed)}" if changed else "",
             folder,
+            "; frames before the correction get the estimates that they had" if changed else "",
         )
         return stage, "none"
     return stage, "stopped"

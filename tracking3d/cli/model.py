@@ -40,17 +40,22 @@ def model(
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --model fine reconstruct its shape too.
 
-    `tracking3d run` does this at its end, with the same option --model.
+    `tracking3d run` does this at its end, with the same option --model. The run's contact sheet, report and turntable
+    are made again, if it has them.
     """
-    from tracking3d.cli.progress import load_with_progress
+    from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
+    from tracking3d.report.renewal import renew_report
+
     outcome = _make_mesh(run, model, source, views, largest, quiet)
     if object_size is not None:
         from tracking3d.results.run_unit import scale_run
 
         scale_run(run, object_size)
         outcome.append(f"{run}: all lengths are in metres")
+    with show_progress(quiet):
+        outcome += map(str, renew_report(run))
     if not quiet:
         typer.echo("\n".join(outcome))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,14 +48,20 @@ def report(
 def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
     """Write the reports of runs when the block ends, however it ends, if at least one frame was tracked.
 
-    If a report cannot be written, that is printed; it does not change how the run ended.
+    If the block ends without an error, finished runs that have no report, or whose files have changed since, get one
+    too. If a report cannot be written, that is printed; it does not change how the run ended.
 
     Args:
         folders: The run folders; none means no reports.
 
     Yields:
         A function that wraps a listener, to note that there is something to report.
+
+    Raises:
+        KeyboardInterrupt: If the writing of the report was interrupted.
     """
+    from tracking3d.results.artefacts import times_written
+
     begun = False
 
     def noting(listener: Listener) -> Listener:
@@ -66,11 +72,24 @@ def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], List
 
         return note
 
+    before = {folder: times_written(folder) for folder in folders}
     try:
         yield noting
-    finally:
+    except BaseException:
         if begun and folders:
-            _write(folders)
+            with suppress(KeyboardInterrupt):  # the first error is raised
+                _write(folders)
+        raise
+    if folders and (begun or any(_is_due(folder, before[folder]) for folder in folders)):
+        _write(folders)
+
+
+def _is_due(folder: Path, before: tuple[int, ...]) -> bool:
+    """Whether a finished run needs a report: it has none, or its files are not as they were."""
+    from tracking3d.results.artefacts import lacks_report, times_written
+    from tracking3d.results.run_reader import is_finished
+
+    return is_finished(folder) and (lacks_report(folder) or times_written(folder) != before)
 
 
 def _write(folders: Sequence[Path]) -> None:
@@ -87,3 +106,4 @@ def _write(folders: Sequence[Path]) -> None:
         )
     except KeyboardInterrupt:
         typer.echo("The report was interrupted. Try again with `tracking3d report`.", err=True)
+        raise

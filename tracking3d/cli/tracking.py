@@ -70,6 +70,7 @@ def track(request: RunRequest, display: RunDisplay) -> None:
     from tracking3d.cli.view import watch
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import record_tracking
+    from tracking3d.results.artefacts import times_written
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
@@ -80,7 +81,7 @@ def track(request: RunRequest, display: RunDisplay) -> None:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(prompts), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    finished = {one: _time_written(one) for one in folders if options.resume and is_finished(one)}
+    finished = {one: times_written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
         plan = plan_run(request.config.model_dump(), source.count, objects, display.report)
@@ -99,17 +100,18 @@ def track(request: RunRequest, display: RunDisplay) -> None:
         _print_summaries(folders, finished)
 
 
-def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, int]) -> None:
+def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, tuple[int, ...]]) -> None:
     """Print the closing table of each run that was not finished before.
 
     Args:
         folders: The run folders.
-        finished: When the runs that had been finished before were written.
+        finished: When the files of the runs that had been finished before were written.
     """
     from tracking3d.cli.summary import print_summary
+    from tracking3d.results.artefacts import times_written
 
     for folder in folders:
-        if folder in finished and finished[folder] == _time_written(folder):
+        if finished.get(folder) == times_written(folder):
             typer.echo(f"The run {folder} is already finished; there is nothing to resume.")
         else:
             print_summary(folder)
@@ -148,10 +150,3 @@ def default_folder(source: str) -> Path:
     if path.name in ("frames", "images"):
         path = path.parent
     return Path("runs", path.stem if path.is_file() else path.name)
-
-
-def _time_written(folder: Path) -> int:
-    """When the description of a run was last written."""
-    from tracking3d.results.layout import RUN
-
-    return (folder / RUN).stat().st_mtime_ns

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.progress import SavedState
 from tracking3d.checkpoint.resuming import Earlier, earlier_run, prompt_record
+from tracking3d.checkpoint.return_point import read_intact_state
 from tracking3d.checkpoint.run_state import RunState
 from tracking3d.checkpoint.staging import keeps_shape, stage_correction, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
+from tracking3d.pipeline.completion import complete_run, is_intact
 from tracking3d.pipeline.known_object import select_camera
 from tracking3d.pipeline.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
 from tracking3d.pipeline.passes import Listener, run_passes
@@ -47,10 +49,11 @@ class RecordOptions:
         command: The command line, for the record.
         selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.
-        resume: Continue the run that is in the folder from its last finished frame, or begin one if there is none. A
-            finished run stays as it is. If a frame that has an estimate is corrected now, what depends on it is
-            computed again from the last checkpoint before it, in a copy within the folder; until that is finished, the
-            run stays as it is.
+        resume: Continue the run that is in the folder from its last finished frame, or begin one if there is none. If
+            files of it are damaged, it goes on from the last saved state of which all is whole. A finished run stays
+            as it is, and what it lacks is made again. If a frame that has an estimate is corrected now, what depends
+            on it is computed again from the last checkpoint before it, in a copy within the folder; until that is
+            finished, the run stays as it is.
         first_pass_only: Stop when every frame has its causal estimate; ``resume`` continues from there.
     """
 
@@ -192,10 +195,13 @@ def record_tracking(
         if unfinished := [recording for recording in recordings if recording is not None]:
             run_passes(opened.source, opened.frames, unfinished, listener, options.first_pass_only)
     for into, recording in zip(folders, recordings, strict=True):
-        if recording is not None and not recording.corrects and not options.first_pass_only:
+        if options.first_pass_only:
+            continue
+        if recording is None:
+            complete_run(into, opened.config, opened.source)
+        elif "shape" not in RunReader(into).description:
             make_final_shape(into, opened.config, opened.source)
-        if not options.first_pass_only:
-            apply_object_size(into, opened.config.object)
+        apply_object_size(into, opened.config.object)
     return [RunReader(into) for into in folders]
 
 
@@ -228,6 +234,7 @@ def begin_recording(
     )
     header = _header(opened, one.session, options, given)
     earlier: Earlier = "none"
+    damaged = False
     if options.resume:
         if not source.repeatable:
             raise InputError(
@@ -236,20 +243,22 @@ def begin_recording(
         take_over(folder)
         earlier = earlier_run(folder, header.config, options.selection, given)
     if earlier == "finished":
-        finish_state(folder)
-        return None
+        if is_intact(folder):
+            finish_state(folder)
+            return None
+        earlier, damaged = "outdated", True
     corrected: Path | None = None
     if earlier == "outdated":
-        corrected = folder
+        corrected = None if damaged else folder
         folder, earlier = stage_correction(folder, header.config, options.selection, given, writers)
-        writers.callback(_reconstruct_shape_again, corrected, folder, opened)
+        writers.callback(_reconstruct_shape_again, folder.parent, folder, opened)
         if earlier == "finished":
             return None
     checkpoint: Checkpoint | None = None
     kept: SavedState | None = None
     if earlier == "stopped":
         checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.rollback_points)
-        kept = checkpoint.read()
+        kept = read_intact_state(folder, checkpoint)
     so_far = WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None
     writer = writers.enter_context(
         RunWriter(folder, header, overwrite=options.overwrite or options.resume, resume=so_far)

@@ -75,11 +75,6 @@ class ObjectRecorder:
         self.refinement: FinalRefinement | None = None
         self.precomputed: PrecomputedRefinement | None = None
 
-    @property
-    def corrects(self) -> bool:
-        """Whether this is the correction of a run, in a copy that takes the run's place."""
-        return self._corrected is not None
-
     @contextmanager
     def writing_beside(self) -> Iterator[None]:
         """Within, estimates are written by another thread while the next frame is solved, one at a time."""

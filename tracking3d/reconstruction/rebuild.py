@@ -21,7 +21,10 @@ from tracking3d.reconstruction.uv_atlas import replace_shape
 from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.notes import notes_of_run
 from tracking3d.results.records import FrameRecord
+from tracking3d.results.redrawing import redraw_contact_sheet
+from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
@@ -75,8 +78,7 @@ def retexture_run(
     if not views:
         raise no_reliable_frame_error(run)
     model = bake_texture(model, views, largest)
-    report_progress("writing the model")
-    export_mesh(run.mesh_folder, model, run.unit)
+    _replace_mesh(run, model)
     return model, len(views)
 
 
@@ -122,8 +124,7 @@ def rebuild_shape(
     made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
         model = bake_texture(online, views, largest)
-        report_progress("writing the model")
-        export_mesh(run.mesh_folder, model, run.unit)
+        _replace_mesh(run, model)
         return ShapedRun(model, len(views), False, made.sentence)
     report_progress("unwrapping the surface")
     model = bake_texture(replace_shape(online, made.vertices, made.faces, shapes), views, largest)
@@ -131,8 +132,7 @@ def rebuild_shape(
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
         export_mesh(kept, online, run.unit)
-    report_progress("writing the model")
-    export_mesh(run.mesh_folder, model, run.unit)
+    _replace_mesh(run, model)
     return ShapedRun(model, len(views), True, made.sentence)
 
 
@@ -150,7 +150,7 @@ def restore_online_mesh(folder: Path) -> bool:
     model = _online_model(run)
     if not (run.mesh_folder / layout.ONLINE / layout.FEATURES).is_file():
         return False
-    export_mesh(run.mesh_folder, model, run.unit)
+    _replace_mesh(run, model)
     return True
 
 
@@ -217,6 +217,16 @@ def check_packages() -> None:
             "A new shape needs scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
             "or leave the mesh as it is."
         )
+
+
+def _replace_mesh(run: RunReader, model: ObjectModel) -> None:
+    """Write the mesh of a run, and what shows it or speaks of it: its notes and its contact sheet."""
+    report_progress("writing the model")
+    export_mesh(run.mesh_folder, model, run.unit)
+    if "notes" in run.description:
+        note_in_run(run.folder, {"notes": notes_of_run(run.description, model, run.frames)})
+    if (run.folder / layout.CONTACT_SHEET).is_file():
+        redraw_contact_sheet(RunReader(run.folder))
 
 
 def _online_model(run: RunReader) -> ObjectModel:

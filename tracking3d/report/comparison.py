@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 
 from tracking3d.report.curves import Curve, curve, stretches
 from tracking3d.report.differences import RunComparison, run_figures
-from tracking3d.report.frame_pictures import jpeg_of, overlay_frames
+from tracking3d.report.frame_pictures import jpeg_of
 from tracking3d.report.rendering import render_page
 from tracking3d.results.files import read_mask, write_atomic
 from tracking3d.results.overlay import OverlaySize
+from tracking3d.results.redrawing import overlay_frames
 from tracking3d.runtime.stage_times import STAGES
 
 _MARGIN = 0.4  # of the longer side of what the masks cover, around it

@@ -7,20 +7,17 @@ shows exactly the frame that it names, in any browser, whatever codecs that has.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.errors import Tracking3dError
-from tracking3d.frames import Frame, Image
-from tracking3d.results import layout
+from tracking3d.frames import Image
 from tracking3d.results.overlay import OverlaySize
+from tracking3d.results.redrawing import overlay_frames
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each
-from tracking3d.video import open_source
 
 BUDGET = 6_500_000
 """Bytes of all pictures of a page; as text in the page they take a third more."""
@@ -79,33 +76,6 @@ def frame_pictures(run: RunReader, budget: int = BUDGET) -> FramePictures:
         jpegs, positions = jpegs[::2], positions[::2]
     shown = tuple(positions[: len(jpegs)])
     return FramePictures(shown, tuple(jpegs), width, _height(width, ratio)) if jpegs else FramePictures()
-
-
-def overlay_frames(run: RunReader, positions: Sequence[int]) -> Iterator[Image]:
-    """The overlays ``(H, W, 3)`` of the estimates at ``positions``, status bar included.
-
-    The video has one frame per estimate, in their order. It may end early, as if the run was killed, or be damaged:
-    then so do these.
-
-    Args:
-        run: The run.
-        positions: Rising positions in ``run.frames``.
-    """
-    path = run.folder / layout.OVERLAY
-    wanted = set(positions)
-    if not wanted or not path.is_file():
-        return
-    last = max(wanted)
-    try:
-        for number, frame in enumerate(open_source(str(path))):
-            if not isinstance(frame, Frame):
-                return
-            if number in wanted:
-                yield frame.image
-            if number == last:
-                return
-    except Tracking3dError:
-        return
 
 
 def jpeg_of(image: NDArray[np.uint8], quality: int = _QUALITY) -> bytes:

@@ -39,11 +39,12 @@ _OBJECT_FOLDER = "object_"
 _DAMAGED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, turntable: bool = True) -> Path:
     """Write the report of a run, and the turntable movie of its model next to it.
 
     Args:
         folder: A run folder: of a run that has ended in any way, or still goes on.
+        turntable: Whether to write the turntable movie.
 
     Returns:
         The report's file.
@@ -64,10 +65,19 @@ def write_report(folder: Path) -> Path:
         ) from error
     path = folder / layout.REPORT
     write_atomic(path, page)
-    if model is not None:
+    if model is not None and turntable:
         with writing(folder / layout.TURNTABLE):
             write_turntable(folder / layout.TURNTABLE, model, front)
     return path
+
+
+def write_turntable_of(folder: Path) -> None:
+    """Write the turntable movie of a run's model alone; see `write_report`."""
+    run = RunReader(folder)
+    model, _ = _model_of(run)
+    if model is not None:
+        with writing(folder / layout.TURNTABLE):
+            write_turntable(folder / layout.TURNTABLE, model, _front(run, model))
 
 
 def _model_of(run: RunReader) -> tuple[ObjectModel | None, str]:

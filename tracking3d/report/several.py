@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.report.figures import status_counts
-from tracking3d.report.frame_pictures import jpeg_of, overlay_frames
+from tracking3d.report.frame_pictures import jpeg_of
 from tracking3d.report.rendering import render_page
 from tracking3d.report.run_report import write_report
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic
 from tracking3d.results.overlay import OverlaySize
+from tracking3d.results.redrawing import overlay_frames
 from tracking3d.results.run_reader import RunReader
 
 

@@ -58,19 +58,31 @@ class Thumbnails:
             estimate: The estimate that it shows.
         """
         if self._frames % self._step == 0:
-            crop = drawing.fit(_around(picture, estimate.mask, scale), TILE)
-            self.kept.append(
-                Thumbnail(estimate.index, crop, estimate.status, estimate.keyframe, estimate.T_cam_obj)
-            )
+            self.keep(picture, scale, estimate)
         self._frames += 1
         if len(self.kept) > MOST:
             self.kept = self.kept[::2]
             self._step *= 2
 
+    def keep(self, picture: Image, scale: float, estimate: FrameEstimate) -> None:
+        """Keep the crop of a frame; for the arguments see `add`."""
+        crop = drawing.fit(_around(picture, estimate.mask, scale), TILE)
+        self.kept.append(
+            Thumbnail(estimate.index, crop, estimate.status, estimate.keyframe, estimate.T_cam_obj)
+        )
+
     def spread(self, count: int) -> list[Thumbnail]:
         """``count`` of them, evenly spread, the first and the last among them."""
         chosen = np.unique(np.linspace(0, len(self.kept) - 1, min(count, len(self.kept))).round().astype(int))
         return [self.kept[i] for i in chosen]
+
+
+def crop_positions(count: int) -> range:
+    """Positions, among so many frames, of those that `Thumbnails` keeps."""
+    step = 1
+    while len(range(0, count, step)) > MOST:
+        step *= 2
+    return range(0, count, step)
 
 
 def draw_contact_sheet(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -44,19 +44,35 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write ``data`` beside ``path`` and rename it into place.
+    """Write ``data`` under a temporary name and rename it into place.
 
     Raises:
         OutputError: If it cannot be written; ``path`` is then as it was.
     """
-    partial = partial_path(path)
-    with writing(path):
-        try:
-            partial.write_bytes(data)
-            partial.replace(path)
-        except OSError:
-            partial.unlink(missing_ok=True)
-            raise
+    write_together({path: data})
+
+
+def write_together(files: Mapping[Path, bytes]) -> None:
+    """Write files that belong together under temporary names, and rename them when all are whole.
+
+    Args:
+        files: Contents by path.
+
+    Raises:
+        OutputError: If one cannot be written; nothing has been renamed then.
+    """
+    try:
+        for path, data in files.items():
+            with writing(path):
+                partial_path(path).write_bytes(data)
+        for path in files:
+            with writing(path):
+                partial_path(path).replace(path)
+    except BaseException:
+        for path in files:
+            with suppress(OSError):
+                partial_path(path).unlink(missing_ok=True)
+        raise
 
 
 def link_or_copy(source: Path, target: Path) -> None:

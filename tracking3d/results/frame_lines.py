@@ -61,7 +61,13 @@ class FrameLines:
         self._file.truncate(0)
 
     def go_on(self, kept: int) -> None:
-        """Continue behind ``kept`` bytes; later lines stay until others are written in their place."""
+        """Continue behind ``kept`` bytes; later lines stay until others are written in their place.
+
+        Raises:
+            OutputError: If the file is shorter.
+        """
+        if self._file.seek(0, 2) < kept:
+            raise OutputError(f"{self._path} is shorter than it was; run it again with {layout.OVERWRITE}.")
         self._kept = kept
 
     def append(self, records: Sequence[FrameRecord]) -> None:

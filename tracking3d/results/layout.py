@@ -46,6 +46,8 @@ CORRECTING = ".correcting"
 DRAWN = ".drawn.png"
 """A mask drawn in the viewer, saved until its correction has started."""
 STATE_FILE = "state.json"
+REFINEMENT_START = "refinement.json"
+"""In `STATE`: the state as the final refinement began."""
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
 CONTACT_SHEET = "contact_sheet.png"
@@ -89,7 +91,7 @@ MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
 _OF_MESH = (*MESH_FILES, LANDMARKS)
 _FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, DRAWN, *_OF_MESH)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
-_OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json")
+_OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json|refinement\.json")
 
 
 def mask_path(folder: Path, index: int) -> Path:

@@ -12,7 +12,7 @@ texel at the two poles mixes with the opposite edge.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,8 +26,9 @@ from trimesh.exchange.obj import export_obj
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
-from tracking3d.results.files import image_file, write_atomic
+from tracking3d.results.files import image_file, write_atomic, write_together
 from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
+from tracking3d.runtime.interruption import interrupts_deferred
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
@@ -36,7 +37,9 @@ _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
 def export_mesh(folder: Path, model: ObjectModel, unit: str = ARBITRARY) -> None:
-    """Write the mesh files of a run.
+    """Write the mesh files of a run: all of them, or none if the program is interrupted.
+
+    If one cannot be made, those before it are written nevertheless.
 
     Args:
         folder: The run folder, or one within.
@@ -47,9 +50,23 @@ def export_mesh(folder: Path, model: ObjectModel, unit: str = ARBITRARY) -> None
         OutputError: If one cannot be written.
     """
     texture = _Texture(model)
-    for name, data in obj_files(model, f"object coordinates, OpenCV axes, unit: {unit}", texture).items():
-        write_atomic(folder / name, data)
-    write_atomic(folder / GLB, glb_file(model, texture=texture, unit=unit))
+    files = obj_files(model, f"object coordinates, OpenCV axes, unit: {unit}", texture)
+    try:
+        files[GLB] = glb_file(model, texture=texture, unit=unit)
+        files[FEATURES] = _features_file(model)
+    except Exception:
+        _write_files(folder, files)
+        raise
+    _write_files(folder, files)
+
+
+def _write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    with interrupts_deferred():
+        write_together({folder / name: data for name, data in files.items()})
+
+
+def _features_file(model: ObjectModel) -> bytes:
+    """The exact model, without its texture image."""
     exact = io.BytesIO()
     seen: dict[str, Any] = {} if model.seen is None else {"seen": model.seen}
     np.savez_compressed(
@@ -61,7 +78,7 @@ def export_mesh(folder: Path, model: ObjectModel, unit: str = ARBITRARY) -> None
         features=model.features,
         **seen,
     )
-    write_atomic(folder / FEATURES, exact.getvalue())
+    return exact.getvalue()
 
 
 class _Texture:
@@ -96,14 +113,15 @@ def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) 
         specular=(0, 0, 0),
         name=Path(TEXTURE).stem,
     )
-    text, files = export_obj(
-        split_mesh(model, simple),
-        include_normals=True,
-        return_texture=True,
-        digits=9,
-        mtl_name=MTL,
-        header=f"tracking3d: {header}",
-    )
+    with interrupts_deferred():  # trimesh would catch them, and leave out normals or texture instead
+        text, files = export_obj(
+            split_mesh(model, simple),
+            include_normals=True,
+            return_texture=True,
+            digits=9,
+            mtl_name=MTL,
+            header=f"tracking3d: {header}",
+        )
     return {OBJ: text.encode(), **files}
 
 
@@ -136,9 +154,10 @@ def glb_file(
         if finish is not None:
             finish(tree)
 
-    data: bytes = export_glb(
-        split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
-    )
+    with interrupts_deferred():  # see `obj_files`
+        data: bytes = export_glb(
+            split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
+        )
     return data
 
 
@@ -221,13 +240,38 @@ def load_model(folder: Path) -> ObjectModel:
     """
     path = _existing(folder / FEATURES)
     try:
-        with np.load(path) as arrays, PillowImage.open(folder / TEXTURE) as image:
+        # From memory: numpy leaves a damaged file open.
+        with (
+            np.load(io.BytesIO(path.read_bytes())) as arrays,
+            PillowImage.open(folder / TEXTURE) as image,
+        ):
             texture: NDArray[np.uint8] = np.asarray(image.convert("RGB"))
             return ObjectModel(texture=texture, **{name: arrays[name] for name in arrays.files})
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(
             f"The model {path} cannot be read ({error}); track again into another {OUT}."
         ) from error
+
+
+def restore_texture(folder: Path) -> bool:
+    """If the texture image of a run is missing, take it from the GLB, if that has it.
+
+    Returns:
+        Whether that was done.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    path = folder / TEXTURE
+    if (path.is_file() and path.stat().st_size) or not (folder / GLB).is_file():
+        return False
+    try:
+        mesh: Any = trimesh.load(folder / GLB, force="mesh", process=False)
+        image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"), dtype=np.uint8)
+    except Exception:  # the GLB is damaged too
+        return False
+    write_atomic(path, image_file(image))
+    return True
 
 
 def _existing(path: Path) -> Path:

@@ -25,7 +25,7 @@ def clear_run_folder(folder: Path, overwrite: bool) -> None:
     if not there:
         return
     try:
-        has_frames = bool(RunReader(folder).frames)
+        has_frames = _has_frames(RunReader(folder))
     except FormatError:  # complete, but not readable by this version
         has_frames = True
     except InputError as error:
@@ -42,3 +42,11 @@ def clear_run_folder(folder: Path, overwrite: bool) -> None:
             # These two are replaced in place, so that a kill in between leaves a run folder.
             if path not in (folder / layout.RUN, folder / layout.FRAMES):
                 path.unlink()
+
+
+def _has_frames(run: RunReader) -> bool:
+    """Whether a run has estimates, readable or not."""
+    try:
+        return bool(run.frames)
+    except InputError:
+        return True

@@ -66,19 +66,14 @@ class Pictures:
         Raises:
             OutputError: If the video cannot be written.
         """
-        estimate = FrameEstimate(
-            index=frame.index,
-            time=frame.time,
-            T_cam_obj=record.T_cam_obj,
-            mask=np.zeros(frame.size, dtype=np.bool_) if mask is None else mask,
-            initial_mask=initial,
-            status=record.status,
-            reason=record.reason,
-            confidence=record.confidence,
-            keyframe=record.keyframe,
-            camera=record.through(self.camera),
-        )
+        found = np.zeros(frame.size, dtype=np.bool_) if mask is None else mask
+        estimate = kept_estimate(record, found, initial, self.camera)
         self.add(frame, estimate, record)
+
+    @property
+    def any(self) -> bool:
+        """Whether a frame was drawn."""
+        return bool(self._thumbnails.kept)
 
     def close(self) -> None:
         """Finish the video.
@@ -101,3 +96,28 @@ class Pictures:
         """
         thumbnails = self._thumbnails.spread(CROPS)
         return draw_contact_sheet(thumbnails, model, run, replaced) if thumbnails else None
+
+
+def kept_estimate(
+    record: FrameRecord, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None, camera: Camera
+) -> FrameEstimate:
+    """A saved estimate, as far as it is drawn.
+
+    Args:
+        record: The estimate.
+        mask: ``(H, W)`` the estimated mask.
+        initial: ``(H, W)`` the initial mask; None if there is none.
+        camera: The camera of the run.
+    """
+    return FrameEstimate(
+        index=record.index,
+        time=record.time,
+        T_cam_obj=record.T_cam_obj,
+        mask=mask,
+        initial_mask=initial,
+        status=record.status,
+        reason=record.reason,
+        confidence=record.confidence,
+        keyframe=record.keyframe,
+        camera=record.through(camera),
+    )

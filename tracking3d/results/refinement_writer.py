@@ -64,7 +64,7 @@ class RefinementWriter(RefinedEstimates):
         self.pictures = Pictures(aside / layout.OVERLAY, camera, fps)
         with writing(aside):
             (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
-            _undo_taking_over(folder)
+            undo_taking_over(folder)
             with (aside / layout.FRAMES).open("ab") as lines:
                 lines.truncate(kept)
         super().__init__(folder, causal, (camera.height, camera.width))
@@ -188,7 +188,7 @@ class RefinementWriter(RefinedEstimates):
         self.pictures.close()
         if not self._taken_over:
             with writing(self._folder):
-                _undo_taking_over(self._folder)
+                undo_taking_over(self._folder)
         if not keep:
             clear_refinement(self._folder)
 
@@ -237,11 +237,16 @@ def clear_refinement(folder: Path) -> None:
             _remove_folders(aside)
 
 
-def _undo_taking_over(folder: Path) -> None:
-    """Restore the causal estimates and move the refined masks away, also after a kill in between."""
+def undo_taking_over(folder: Path) -> None:
+    """Restore the causal estimates and move the refined masks away, also after a kill in between.
+
+    Raises:
+        OSError: If a file cannot be moved.
+    """
     causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
     if not causal.is_dir():
         return
+    (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
     for file in layout.run_files(folder):
         if file.is_relative_to(causal):
             place = folder / file.relative_to(causal)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
+from tracking3d.results.artefacts import check_complete
 from tracking3d.results.files import (
     first_problem,
     read_mask,
@@ -236,12 +238,7 @@ class RunWriter:
             return
         self._over = True
         try:
-            problem = first_problem(
-                self._pictures.close,
-                partial(self._give_up_refinement, state, error),
-                *([] if model is None else [partial(export_mesh, self.folder, model)]),
-                partial(self._finish, model),
-            )
+            problem = self._write_final_files(model, state, error)
             if problem:
                 state, error = "failed", str(problem)
             ended = {"state": state, "error": error, "finished": description.now()}
@@ -255,6 +252,11 @@ class RunWriter:
                 self._write_description()
             if state == "finished":
                 clear_refinement(self.folder)
+        except KeyboardInterrupt:
+            if self._description["state"] == "running":
+                self._description |= {"state": "interrupted", "finished": description.now()}
+                self._write_description()
+            raise
         finally:
             self._lines.close()
         if problem:
@@ -320,6 +322,22 @@ class RunWriter:
         if self._refinement is not None:
             self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.describe(state, error or "")
+
+    def _write_final_files(
+        self, model: ObjectModel | None, state: FinalState, error: str | None
+    ) -> Exception | None:
+        """Write all files that can be written; the first problem with any of them."""
+        steps: list[Callable[[], None]] = [
+            self._pictures.close,
+            partial(self._give_up_refinement, state, error),
+            partial(self._finish, model),
+        ]
+        if model is not None:
+            steps.insert(2, partial(export_mesh, self.folder, model))
+        if state == "finished":
+            mesh, pictures = model is not None, self._pictures.any
+            steps.append(partial(check_complete, self.folder, mesh=mesh, pictures=pictures))
+        return first_problem(*steps)
 
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))

@@ -18,8 +18,9 @@ from trimesh.exchange.obj import export_obj
 from tracking3d.datasets.clip import POSE_CONVENTION
 from tracking3d.errors import OutputError
 from tracking3d.geometry.camera import Camera
-from tracking3d.results.files import write_atomic, write_image, write_mask, writing
+from tracking3d.results.files import write_atomic, write_image, write_mask, write_together, writing
 from tracking3d.results.layout import partial_path
+from tracking3d.runtime.interruption import interrupts_deferred
 from tracking3d.synthesis.camera_effects import compress
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
 from tracking3d.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks
@@ -185,7 +186,6 @@ def _write_mesh(folder: Path, solid: Solid) -> None:
         mesh.visual = trimesh.visual.TextureVisuals(solid.uvs, material=material)
     else:
         mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=solid.colours)
-    text, files = export_obj(mesh, return_texture=True, digits=9, mtl_name="mesh.mtl", header=solid.frame)
-    write_atomic(folder / "mesh.obj", text.encode())
-    for name, data in files.items():
-        write_atomic(folder / name, data)
+    with interrupts_deferred():  # trimesh would catch them, and leave out the texture instead
+        text, files = export_obj(mesh, return_texture=True, digits=9, mtl_name="mesh.mtl", header=solid.frame)
+    write_together({folder / name: data for name, data in {"mesh.obj": text.encode(), **files}.items()})
