@@ -98,8 +98,8 @@ def test_a_video_knows_its_frames_if_its_header_counts_them(clip, tmp_path):
     with closing(VideoWriter(uncounted, 25, clip.images[0].shape[:2])) as growing:
         for image in clip.images:
             growing.write(image)
-    assert known_indices(open_source(str(uncounted))) is None
-    assert known_indices(open_source(str(uncounted), "0:2")) == range(2)
+        assert known_indices(open_source(str(uncounted))) is None
+        assert known_indices(open_source(str(uncounted), "0:2")) == range(2)
 
 
 def test_a_run_names_its_frames_and_the_reason_of_those_that_it_skipped(clip, images, tmp_path):
