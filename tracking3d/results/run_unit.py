@@ -35,7 +35,7 @@ _SIZE = argument("object_size=", "--object-size")
 
 
 @dataclass(frozen=True)
-class Scales:
+class RunScale:
     """What ``run.json`` says of the unit of a run in metres.
 
     Attributes:
@@ -127,7 +127,7 @@ def scale_run(folder: Path, object_size: float) -> None:
     before = _scales(run)
     factor = metres_per_unit(load_model(run.mesh_folder), object_size)
     causal_factor = metres_per_unit(load_model(causal.mesh_folder), object_size)
-    now = Scales(object_size, before.scale * factor, before.causal_scale * causal_factor, before.own_lines)
+    now = RunScale(object_size, before.scale * factor, before.causal_scale * causal_factor, before.own_lines)
     factors = {
         run.mesh_folder / layout.ONLINE: factor,
         causal.mesh_folder: causal_factor,
@@ -158,7 +158,7 @@ def load_own_model(run: RunReader, mesh_folder: Path) -> ObjectModel:
     return scale_model(load_model(mesh_folder), 1 / _scales(run).scale)
 
 
-def _scale_by(folder: Path, now: Scales, factors: Mapping[Path, float]) -> None:
+def _scale_by(folder: Path, now: RunScale, factors: Mapping[Path, float]) -> None:
     """Note what the scaling comes to, so that it can be completed if it is interrupted, and scale."""
     extents = {
         place.relative_to(folder).as_posix(): by * _extent(load_model(place))
@@ -172,7 +172,7 @@ def _scale_by(folder: Path, now: Scales, factors: Mapping[Path, float]) -> None:
 
 def _scale_files(folder: Path, scaling: Mapping[str, Any]) -> None:
     """Write every file in the new unit; what was written before an interruption stays as it is."""
-    now = Scales(**scaling["to"])
+    now = RunScale(**scaling["to"])
     landmarks = {
         refined: found
         for refined in (True, False)
@@ -191,14 +191,14 @@ def _scale_files(folder: Path, scaling: Mapping[str, Any]) -> None:
     note_in_run(folder, {"unit": {"name": METRE, **asdict(now)}, "scaling": {}})
 
 
-def _write_lines(folder: Path, now: Scales) -> None:
+def _write_lines(folder: Path, now: RunScale) -> None:
     file = folder / layout.FRAMES
     own = list(read_records(file, now.own_lines))
     lines = b"".join(record.to_json().encode() + b"\n" for record in _scaled(own, now))
     write_atomic(file, file.read_bytes()[: now.own_lines] + lines)
 
 
-def _scaled(own: list[FrameRecord], now: Scales) -> Iterator[FrameRecord]:
+def _scaled(own: list[FrameRecord], now: RunScale) -> Iterator[FrameRecord]:
     """The estimates that count, in metres: the causal ones, then those of the final refinement."""
     for record in latest(own, refined=False):
         yield replace(record, T_cam_obj=scale_pose(record.T_cam_obj, now.causal_scale))
@@ -207,12 +207,12 @@ def _scaled(own: list[FrameRecord], now: Scales) -> Iterator[FrameRecord]:
             yield replace(record, T_cam_obj=scale_pose(record.T_cam_obj, now.scale))
 
 
-def _scales(run: RunReader) -> Scales:
+def _scales(run: RunReader) -> RunScale:
     unit = dict(run.description.get("unit") or {})
     if unit.pop("name", None) != METRE:
-        return Scales(0.0, 1.0, 1.0, (run.folder / layout.FRAMES).stat().st_size)
+        return RunScale(0.0, 1.0, 1.0, (run.folder / layout.FRAMES).stat().st_size)
     try:
-        return Scales(**unit)
+        return RunScale(**unit)
     except TypeError as error:
         raise InputError(
             f"{run.folder / layout.RUN} is damaged: unit is {unit!r:.40}; restore it."
