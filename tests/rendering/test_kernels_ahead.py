@@ -88,6 +88,34 @@ def test_nothing_is_started_or_said_while_another_process_compiles_them(started,
     assert (started, caplog.messages) == ([], [])
 
 
+def test_nothing_is_started_while_the_process_that_compiles_them_still_imports(started, caplog):
+    assert compile_in_background()
+    with caplog.at_level(logging.WARNING):
+        caplog.clear()
+        assert not compile_in_background()
+    assert (len(started), caplog.messages) == (1, [])
+
+
+def test_all_processes_ask_for_the_same_lock(monkeypatch):
+    """Kernels lie in several folders, so that any of them might be the one that is missing."""
+    assert (
+        len({one.folder for name in kernel_modules() for one in find_kernels(importlib.import_module(name))})
+        > 1
+    )
+    taken = []
+    monkeypatch.setattr(
+        kernels_ahead, "FileLock", lambda path, timeout: taken.append(path) or FileLock(path, timeout)
+    )
+    monkeypatch.setattr(kernels_ahead, "_compile_all", lambda modules, processes: 0)
+    monkeypatch.setattr(kernels_ahead.os, "nice", lambda by: 0)
+    monkeypatch.setattr(kernels_ahead.Kernel, "is_kept", False)
+    monkeypatch.setattr(kernels_ahead, "_was_started", lambda mark: True)
+    compile_in_background()
+    kernels_ahead.main(in_background=True)
+    assert len(taken) == 2
+    assert len(set(taken)) == 1
+
+
 def test_quiet_says_nothing(started, caplog):
     with caplog.at_level(logging.WARNING):
         assert compile_in_background(quiet=True)

@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +23,9 @@ from tracking3d.rendering.kernels.compilation import Kernel, announce_compilatio
 _FIRST = "tracking3d.estimation.online.optimization.kernels.pose_refinement"
 """Takes as long as ten others, and is needed soon."""
 _MOST_PROCESSES = 8
-_LOCK = "all_kernels.lock"
+_LOCK, _STARTED = "all_kernels.lock", "all_kernels.started"
+_START = 60.0
+"""Seconds that a started process may take until it has the lock."""
 
 
 def kernel_modules() -> list[str]:
@@ -64,14 +67,17 @@ def compile_in_background(quiet: bool = False) -> bool:
         Whether a process was started; not if all are kept, they cannot be kept, or another process is at it.
     """
     kernels = [one for name in kernel_modules() for one in find_kernels(importlib.import_module(name))]
-    missing = next((one for one in kernels if not one.is_kept), None)
-    lock = None if missing is None else _lock_of(missing)
-    if lock is None:
+    folder = kernels[0].folder
+    if folder is None or all(one.is_kept for one in kernels):
         return False
     try:
-        lock.acquire(timeout=0)
-        lock.release()  # the process that is started takes it
+        with FileLock(folder / _LOCK, timeout=0):
+            alone = not _was_started(folder / _STARTED)
+            if alone:
+                (folder / _STARTED).touch()  # the process that is started takes the lock when it has imported
     except (Timeout, OSError, NotImplementedError):
+        alone = False
+    if not alone:
         announce_compilation("", quiet=True)
         return False
     announce_compilation("this is done once, in the background", quiet)
@@ -95,12 +101,12 @@ def main(in_background: bool = False) -> None:
     """
     modules = sorted(kernel_modules(), key=lambda name: name != _FIRST)
     if in_background:
-        lock = _lock_of(find_kernels(importlib.import_module(_FIRST))[0])
+        folder = find_kernels(importlib.import_module(kernel_modules()[0]))[0].folder
         with suppress(AttributeError, OSError):
             os.nice(10)
         with suppress(Timeout, OSError, NotImplementedError):
-            if lock is not None:
-                with lock.acquire(timeout=0):
+            if folder is not None:
+                with FileLock(folder / _LOCK, timeout=0):
                     _compile_all(modules, max((os.cpu_count() or 1) - 1, 1))
         return
     print(f"{_compile_all(modules, os.cpu_count() or 1)} kernels are compiled.")
@@ -111,10 +117,12 @@ def _compile_all(modules: list[str], processes: int) -> int:
         return sum(pool.imap_unordered(compile_module, modules))
 
 
-def _lock_of(kernel: Kernel) -> FileLock | None:
-    """The lock of the process that compiles all kernels of this installation; None if they cannot be kept."""
-    folder = kernel.folder
-    return None if folder is None else FileLock(folder / _LOCK)
+def _was_started(mark: Path) -> bool:
+    """Whether a process that compiles all kernels was started a moment ago, and is still importing."""
+    try:
+        return time.time() - mark.stat().st_mtime < _START
+    except OSError:
+        return False
 
 
 if __name__ == "__main__":
