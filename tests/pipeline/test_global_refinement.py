@@ -27,6 +27,7 @@ from tracking3d.results.files import write_image
 from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord, latest
+from tracking3d.results.overlay import OverlaySize
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
@@ -216,7 +217,8 @@ def test_the_overlay_is_drawn_again(clip, source, tmp_path):
         with av.open(str(folder / "overlay.mp4")) as video:
             pictures = [picture.to_ndarray(format="rgb24") for picture in video.decode(video=0)]
         assert len(pictures) == FRAMES
-        bar = pictures[2][-18:, :120].reshape(-1, 3).astype(int)
+        below = OverlaySize.of(RunReader(folder).camera).picture
+        bar = pictures[2][below:, :120].reshape(-1, 3).astype(int)
         greens[refine] = (bar[:, 1] - bar[:, 0]).max()
     assert greens[True] > 60 > greens[False]
     assert not (tmp_path / "run_True" / layout.REFINING).exists()

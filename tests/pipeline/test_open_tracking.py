@@ -98,7 +98,7 @@ def test_what_cannot_be_a_prompt_is_refused_before_the_first_frame(prompts, mess
 
 
 def test_every_object_has_a_session_its_prompt_and_its_corrections():
-    corrections = [Correction(3, box=BOX), Correction(2, box=OTHER, object=1)]
+    corrections = [Correction(3, box=BOX, object=0), Correction(2, box=OTHER, object=1)]
     request = request_tracking(Source([Frame(0, picture())]), settings(), two(), corrections)
     with open_tracking(request) as opened:
         first, second = opened.objects

@@ -370,7 +370,7 @@ def test_a_frame_that_never_comes_is_told(clip, images, tmp_path, caplog):
 
     given = [Correction(99, box=(1, 1, 5, 5))]
     record(Unselected(), settings(CAUSAL), tmp_path / "run", mask=clip.masks[0], corrections=given)
-    assert "Frame 99, which was to be corrected, is not among the frames" in caplog.text
+    assert "Frame 99, which was to be corrected, could not be read: there are 7 frames" in caplog.text
 
 
 def test_each_object_has_its_own_corrections(clip, images, tmp_path):
