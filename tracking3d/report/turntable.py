@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.results.layout import partial_path
-from tracking3d.results.mesh_view import render_view
+from tracking3d.results.mesh_view import render_view, texture_of_views
 from tracking3d.runtime.progress import report_each
 from tracking3d.video.writer import VideoWriter
 
@@ -32,12 +32,12 @@ def write_turntable(path: Path, model: ObjectModel, rotation: NDArray[np.float64
     Raises:
         OutputError: If it cannot be written.
     """
-    partial = partial_path(path)
+    partial, texture = partial_path(path), texture_of_views(model, SIDE)
     try:
         with VideoWriter(partial, FPS, (SIDE, SIDE)) as video:
             for yaw in report_each("turntable", np.arange(VIEWS) * 360.0 / VIEWS):
                 turned = Rotation.from_euler("yx", [yaw, PITCH], degrees=True).as_matrix() @ rotation
-                video.write(render_view(model, turned, SIDE))
+                video.write(render_view(model, turned, SIDE, texture))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

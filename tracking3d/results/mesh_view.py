@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Image
@@ -21,6 +23,7 @@ _UNSEEN = 165.0
 _AMBIENT, _AMBIENT_UNSEEN = 0.45, 0.75  # unseen surface stays pale even if it faces away
 _DISTANCE = 4.0  # of the camera, in radii of the object
 _FILL = 0.8  # of the picture's side
+_FINEST = 4  # texels of a texture's side for a pixel of the picture's
 
 
 def side_shown(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -58,7 +61,25 @@ def most_different(rotations: NDArray[np.float64], count: int) -> list[int]:
     return chosen
 
 
-def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) -> Image:
+def texture_of_views(model: ObjectModel, size: int) -> Tensor:
+    """The texture that views of a size sample ``(4, H, W)``: the colour of what was seen, and how much of it was.
+
+    Args:
+        model: The object.
+        size: Side of the views in pixels; a texture that is much finer is averaged.
+    """
+    seen = (model.texture_weight > 0)[..., None]
+    layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
+    while min(layers.shape[:2]) >= _FINEST * size:
+        layers = cv2.resize(
+            layers, (layers.shape[1] // 2, layers.shape[0] // 2), interpolation=cv2.INTER_AREA
+        )
+    return torch.tensor(np.ascontiguousarray(layers.transpose(2, 0, 1)))
+
+
+def render_view(
+    model: ObjectModel, rotation: NDArray[np.float64], size: int, texture: Tensor | None = None
+) -> Image:
     """Draw the whole object, lit from the camera, into a square picture ``(size, size, 3)``.
 
     Texels that were never seen are of a pale grey.
@@ -67,7 +88,9 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
         model: The object.
         rotation: ``(3, 3)`` object to camera.
         size: Side in pixels.
+        texture: See `texture_of_views`, for whoever draws several.
     """
+    texture = texture_of_views(model, size) if texture is None else texture
     low, high = model.vertices.min(0), model.vertices.max(0)
     centred = (model.vertices - (low + high) / 2) @ rotation.T
     radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
@@ -83,9 +106,6 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
     uv, normal, at = interpolate(
         screen, depth, faces, torch.tensor(corners, dtype=torch.float32), face_index
     ).split([2, 3, 3], dim=1)
-    seen = (model.texture_weight > 0)[..., None]
-    layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
-    texture = torch.tensor(layers.transpose(2, 0, 1))
     colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
     ambient = weight * _AMBIENT + (1 - weight) * _AMBIENT_UNSEEN
     colour = colour + (1 - weight) * _UNSEEN
