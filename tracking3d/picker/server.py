@@ -218,7 +218,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _refuse(self, status: HTTPStatus, reason: str) -> None:
-        self._send(status, (reason + "\n").encode(), "text/plain; charset=utf-8")
+        self._send(status, (reason + "\n").encode("utf-8", "replace"), "text/plain; charset=utf-8")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str = "text/plain", **headers: str) -> None:
         self.close_connection = True
