@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tracking3d.datasets.readers.restricted_pickle import read_pickle
-from tracking3d.errors import InputError
 
 FRAMES = np.arange(24).reshape(2, 3, 4)
 ARRAYS = {
