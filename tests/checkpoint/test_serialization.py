@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from large_arrays import memory_stays_below, write_zeros
 
 from tracking3d import Frame, Session, load_config
 from tracking3d.checkpoint.folder import Checkpoint
@@ -180,6 +181,41 @@ def test_what_nobody_has_named_is_refused(tmp_path, value):
 def test_what_was_tampered_with_is_no_tree(tmp_path, node):
     with pytest.raises(ValueError):
         TreeFolder(tmp_path, CLASSES).read(node)
+
+
+@pytest.mark.parametrize("kind", ["array", "sparse"])
+@pytest.mark.parametrize(
+    "name", ["../00000000.npz", "/etc/00000000.npz", "notes.npz", "link", 7, None, ["00000000.npz"]]
+)
+def test_only_arrays_of_the_state_are_read_and_none_is_removed_elsewhere(tmp_path, name, kind):
+    inner = tmp_path / ".state"
+    inner.mkdir()
+    np.savez(tmp_path / "00000000.npz", array=LARGE, index=np.zeros((1, 1), int), value=np.zeros(1))
+    (inner / "00000007.npz").symlink_to(tmp_path / "00000000.npz")
+    place = "00000007.npz" if name == "link" else name
+    node = {
+        "array": {"array": "<f4", "shape": [40, 30], "file": place},
+        "sparse": {"sparse": {"file": place}, "size": [3]},
+    }
+    folder = TreeFolder(inner, CLASSES)
+    with pytest.raises(ValueError, match="no file of this state"):
+        folder.read(node[kind])
+    folder.tidy()
+    assert (tmp_path / "00000000.npz").is_file()
+
+
+@pytest.mark.parametrize("name", ["array", "bits"])
+def test_no_array_of_a_state_is_larger_than_its_file(tmp_path, name):
+    write_zeros(tmp_path / "00000000.npz", **{name: (2**27,)})
+    with memory_stays_below(2**24), pytest.raises(ValueError, match="134 MB"):
+        TreeFolder(tmp_path, CLASSES).read({"array": "|u1", "shape": [2**27], "file": "00000000.npz"})
+
+
+@pytest.mark.parametrize("shape", [[10**12], [-5], [2**40, 2**40]])
+def test_bits_are_as_many_as_the_state_says(tmp_path, shape):
+    np.savez(tmp_path / "00000000.npz", bits=np.zeros(9, np.uint8))
+    with pytest.raises(ValueError, match="another array than was saved"):
+        TreeFolder(tmp_path, CLASSES).read({"array": "|b1", "shape": shape, "file": "00000000.npz"})
 
 
 def test_a_damaged_array_is_told(tmp_path):

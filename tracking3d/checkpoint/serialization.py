@@ -10,23 +10,25 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
-from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from torch import Tensor
+
+from tracking3d.runtime.array_files import ArrayFile
 
 INLINE = 1024
 """Bytes from which on an array has a file of its own."""
 SUFFIX = ".npz"
+_KINDS = "biuf"
+_NAME = re.compile(r"\d{8,}\.npz")
 
 
 class NotSerializableError(TypeError):
@@ -99,7 +101,7 @@ class TreeFolder:
         self._root = _Part(None, "")
         try:
             return self._decode(node, self._root)
-        except (OSError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, RuntimeError) as error:
+        except (OSError, KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise ValueError(str(error) or type(error).__name__) from error
         finally:
             self._by_text.clear()
@@ -189,7 +191,7 @@ class TreeFolder:
         return f'{{"tensor": {text}, "axes": {axes}}}', file
 
     def _encode_array(self, array: NDArray[Any]) -> tuple[str, str | None]:
-        if array.dtype.kind not in "biuf":
+        if array.dtype.kind not in _KINDS:
             raise NotSerializableError(f"an array of {array.dtype} cannot be saved")
         about: dict[str, Any] = {"array": array.dtype.str, "shape": list(array.shape)}
         if array.nbytes < INLINE:
@@ -207,10 +209,14 @@ class TreeFolder:
         np.savez(self._folder / name, **arrays)  # type: ignore[arg-type]
         return name
 
-    def _open(self, name: str) -> NpzFile:
-        # From memory: numpy leaves a damaged file open.
-        opened: NpzFile = np.load(BytesIO((self._folder / name).read_bytes()), allow_pickle=False)
-        return opened
+    def _open(self, name: Any) -> ArrayFile:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or (self._folder / name).is_symlink():
+            raise ValueError(f"it names {name!r}, which is no file of this state")
+        return ArrayFile(self._folder / name)
+
+    def _read(self, arrays: ArrayFile, name: str) -> NDArray[Any]:
+        # They are written uncompressed, so that none is larger than its file.
+        return arrays.read(name, arrays.bytes)
 
     def _decode(self, node: Any, within: _Part) -> Any:
         if isinstance(node, list):
@@ -247,8 +253,8 @@ class TreeFolder:
 
     def _read_part(self, node: dict[str, Any], inner: dict[str, Any], text: str, file: str | None) -> _Part:
         if "sparse" in node:
-            with self._open(str(file)) as arrays:
-                index, value = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["value"])
+            with self._open(file) as arrays:
+                index, value = (torch.from_numpy(self._read(arrays, name)) for name in ("index", "value"))
             sparse = torch.sparse_coo_tensor(index, value, node["size"], check_invariants=True)
             return _Part(sparse.coalesce().to(self._device), text, file)
         array = self._array(inner)
@@ -259,13 +265,17 @@ class TreeFolder:
 
     def _array(self, node: dict[str, Any]) -> NDArray[Any]:
         kind, shape = np.dtype(node["array"]), tuple(node["shape"])
+        if kind.kind not in _KINDS:
+            raise ValueError(f"it holds an array of {kind}")
         if "data" in node:
             return np.frombuffer(base64.b64decode(node["data"]), kind).reshape(shape).copy()
         with self._open(node["file"]) as arrays:
-            if "bits" in arrays.files:
-                flat = np.unpackbits(arrays["bits"], count=math.prod(shape)).astype(kind)
-                return flat.reshape(shape)
-            found: NDArray[Any] = arrays["array"]
+            if "bits" in arrays.names:
+                bits, count = self._read(arrays, "bits"), math.prod(shape)
+                if not 0 <= count <= 8 * bits.size:
+                    raise ValueError(f"{node['file']} holds another array than was saved")
+                return np.unpackbits(bits, count=count).astype(kind).reshape(shape)
+            found = self._read(arrays, "array")
         if found.shape != shape or found.dtype != kind:
             raise ValueError(f"{node['file']} holds another array than was saved")
         return found
