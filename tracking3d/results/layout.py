@@ -42,6 +42,10 @@ REFINING = ".refining"
 STATE = ".state"
 PROMPTS = "prompts"
 CORRECTING = ".correcting"
+PARTS = "parts"
+"""The parts of a video that is tracked in parts, until they are merged."""
+PICKED = "picked"
+"""What was drawn before the run: masks in a folder of this name, and files with its name and a suffix."""
 DRAWN = ".drawn.png"
 """A mask drawn in the viewer, saved until its correction has started."""
 STATE_FILE = "state.json"
@@ -95,12 +99,24 @@ def initial_mask_path(folder: Path, index: int) -> Path:
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
+def refuse_root(folder: Path) -> None:
+    """Refuse to write into the root of a file system.
+
+    Raises:
+        OutputError: If ``folder`` is one.
+    """
+    whole = folder.resolve()
+    if whole == Path(whole.anchor):
+        raise OutputError(f"{folder} is the root of a file system; give a folder in it as {OUT}.")
+
+
 def object_folders(folder: Path, count: int) -> list[Path]:
     """The run folders of ``count`` objects that are tracked through one video.
 
     Raises:
         OutputError: If ``folder`` is the run folder of one object, or holds more objects.
     """
+    refuse_root(folder)
     if (folder / RUN).exists():
         raise OutputError(f"{folder} holds a run of one object; choose another {OUT} for several.")
     if (more := folder / f"object_{count}").exists():
@@ -131,7 +147,7 @@ def partial_path(path: Path) -> Path:
 
 def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
-    named = [folder / name for name in _FILES]
+    named = top_files(folder)
     named += [folder / CAUSAL / name for name in _OF_MESH]
     named += [folder / ONLINE / name for name in MESH_FILES]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
@@ -148,6 +164,18 @@ def run_files(folder: Path) -> list[Path]:
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
     return _add_unfinished(named) + state_files(folder) + correction_files(folder)
+
+
+def top_files(folder: Path) -> list[Path]:
+    """The files that a run writes into ``folder`` itself, whether they are there or not."""
+    return [folder / name for name in _FILES]
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """The folders within a run folder, whether they are there or not; outer ones first."""
+    inner = (CAUSAL, ONLINE, REFINING, STATE, CORRECTING, PARTS, MASKS, INITIAL_MASKS, PROBABILITIES, PROMPTS)
+    within = ((CAUSAL, MASKS), (REFINING, MASKS), (REFINING, PROBABILITIES), (STATE, MASKS))
+    return [folder / name for name in inner] + [folder / outer / name for outer, name in within]
 
 
 def correction_files(folder: Path) -> list[Path]:
