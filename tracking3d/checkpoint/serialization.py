@@ -26,6 +26,8 @@ from tracking3d.runtime.array_files import ArrayFile
 
 INLINE = 1024
 """Bytes from which on an array has a file of its own."""
+MOST_COMPRESSED = 2**30
+"""Bytes that the arrays of one tree may take beyond those of their files."""
 SUFFIX = ".npz"
 _KINDS = "biuf"
 _NAME = re.compile(r"\d{8,}\.npz")
@@ -80,6 +82,7 @@ class TreeFolder:
         self._next = max(numbers, default=-1) + 1
         self._root = _Part(None, "null")
         self._spared: set[str] = set()  # files of earlier trees that are needed still
+        self._left = MOST_COMPRESSED
 
     def text(self, tree: Any) -> str:
         """The tree as JSON text; arrays that are not in a file yet are written.
@@ -98,7 +101,7 @@ class TreeFolder:
         Raises:
             ValueError: If it is not one, or an array is missing or damaged.
         """
-        self._root = _Part(None, "")
+        self._root, self._left = _Part(None, ""), MOST_COMPRESSED
         try:
             return self._decode(node, self._root)
         except (OSError, KeyError, TypeError, AttributeError, RuntimeError) as error:
@@ -215,8 +218,14 @@ class TreeFolder:
         return ArrayFile(self._folder / name)
 
     def _read(self, arrays: ArrayFile, name: str) -> NDArray[Any]:
-        # They are written uncompressed, so that none is larger than its file.
-        return arrays.read(name, arrays.bytes)
+        self._reserve(arrays.header(name).nbytes, arrays.bytes)
+        return arrays.read(name, arrays.header(name).nbytes)
+
+    def _reserve(self, size: int, expected: int) -> None:
+        """Count what an array takes beyond what is ``expected`` of its file; only rollback points are compressed."""
+        self._left -= max(size - expected, 0)
+        if self._left < 0:
+            raise ValueError("its arrays take more memory than those of a state")
 
     def _decode(self, node: Any, within: _Part) -> Any:
         if isinstance(node, list):
@@ -274,6 +283,7 @@ class TreeFolder:
                 bits, count = self._read(arrays, "bits"), math.prod(shape)
                 if not 0 <= count <= 8 * bits.size:
                     raise ValueError(f"{node['file']} holds another array than was saved")
+                self._reserve(count * kind.itemsize, 8 * arrays.bytes * kind.itemsize)
                 return np.unpackbits(bits, count=count).astype(kind).reshape(shape)
             found = self._read(arrays, "array")
         if found.shape != shape or found.dtype != kind:
