@@ -24,6 +24,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from tracking3d.errors import OutputError, argument
@@ -105,9 +106,9 @@ def refuse_root(folder: Path) -> None:
     Raises:
         OutputError: If ``folder`` is one.
     """
-    whole = folder.resolve()
-    if whole == Path(whole.anchor):
-        raise OutputError(f"{folder} is the root of a file system; give a folder in it as {OUT}.")
+    with suppress(OSError):  # it does not exist yet
+        if folder.samefile(folder.absolute().anchor):
+            raise OutputError(f"{folder} is the root of a file system; give a folder in it as {OUT}.")
 
 
 def object_folders(folder: Path, count: int) -> list[Path]:
@@ -137,7 +138,12 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def _is_object(folder: Path) -> bool:
-    return folder.name.removeprefix("object_").isdecimal() and (folder / RUN).is_file()
+    return is_object_name(folder.name) and (folder / RUN).is_file()
+
+
+def is_object_name(name: str) -> bool:
+    """Whether a folder's name is that of one of several objects."""
+    return name.startswith("object_") and name.removeprefix("object_").isdecimal()
 
 
 def partial_path(path: Path) -> Path:
@@ -147,7 +153,7 @@ def partial_path(path: Path) -> Path:
 
 def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
-    named = top_files(folder)
+    named = [folder / name for name in _FILES]
     named += [folder / CAUSAL / name for name in _OF_MESH]
     named += [folder / ONLINE / name for name in MESH_FILES]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
@@ -164,11 +170,6 @@ def run_files(folder: Path) -> list[Path]:
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
     return _add_unfinished(named) + state_files(folder) + correction_files(folder)
-
-
-def top_files(folder: Path) -> list[Path]:
-    """The files that a run writes into ``folder`` itself, whether they are there or not."""
-    return [folder / name for name in _FILES]
 
 
 def run_folders(folder: Path) -> list[Path]:
@@ -212,4 +213,5 @@ def state_files(folder: Path) -> list[Path]:
 
 
 def _add_unfinished(files: list[Path]) -> list[Path]:
-    return [path for file in files for path in (file, partial_path(file)) if path.is_file()]
+    both = [path for file in files for path in (file, partial_path(file))]
+    return [path for path in both if path.is_file() or path.is_symlink()]

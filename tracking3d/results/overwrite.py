@@ -12,27 +12,27 @@ from tracking3d.results.run_reader import FormatError, RunReader
 _SYSTEM = frozenset(("desktop.ini", "Thumbs.db"))  # those of other systems begin with a dot
 
 
-def check_run_folder(folder: Path, overwrite: bool) -> None:
-    """Check that a run may go into a folder, before anything is written there; of an earlier run nothing is said.
+def check_output_folder(folder: Path, overwrite: bool) -> None:
+    """Check that a run may go into a folder, before anything is written there.
+
+    An earlier run in it is accepted here: `clear_run_folder` asks whether it may be replaced.
 
     Raises:
         OutputError: If it is the root of a file system, or holds other files and ``overwrite`` is not set.
     """
     layout.refuse_root(folder)
-    lines = folder / layout.FRAMES
     with writing(folder):
         if overwrite or not folder.is_dir():
             return
-        if lines.is_symlink():  # they would be written elsewhere
-            other: Path | None = lines
-        elif layout.run_files(folder):
-            return
-        else:
+        other: Path | None = folder / layout.FRAMES
+        if not other.is_symlink():  # a link would be written through
+            if layout.run_files(folder):
+                return
             other = next((path for path in sorted(folder.iterdir()) if _is_foreign(path)), None)
     if other is not None:
         raise OutputError(
-            f"{folder} holds something that is not a run's, such as {other.name}; choose another {layout.OUT}, or "
-            f"pass {layout.OVERWRITE} to put the run beside it."
+            f"{folder} holds {other.name}, which is no part of a run; choose another {layout.OUT}, or pass "
+            f"{layout.OVERWRITE} to write the run next to it."
         )
 
 
@@ -44,21 +44,28 @@ def clear_run_folder(folder: Path, overwrite: bool) -> None:
     Raises:
         OutputError: If there is one and ``overwrite`` is not set, or if files there are not a run's.
     """
-    check_run_folder(folder, overwrite)
+    check_output_folder(folder, overwrite)
     there = _run_files(folder)
     if there and there != [layout.partial_path(folder / layout.RUN)]:  # else killed before anything was there
         _check_replaceable(folder, overwrite, there[0])
-    remove_links(folder)
+    # These two are replaced in place, so that a kill in between leaves a run folder.
+    kept = (folder / layout.RUN, folder / layout.FRAMES)
     with writing(folder):
+        for inner in layout.run_folders(folder):  # outer ones first: what is in a linked one is elsewhere
+            if inner.is_symlink():
+                inner.unlink()
         for path in _run_files(folder):
-            # These two are replaced in place, so that a kill in between leaves a run folder.
-            if path not in (folder / layout.RUN, folder / layout.FRAMES):
+            if path.is_symlink() or path not in kept:
                 path.unlink()
 
 
 def _run_files(folder: Path) -> list[Path]:
     """Those of an earlier run; the file of lines is made before, to lock the folder."""
-    return [path for path in layout.run_files(folder) if path.name != layout.FRAMES or path.stat().st_size]
+    return [
+        path
+        for path in layout.run_files(folder)
+        if path.name != layout.FRAMES or path.is_symlink() or path.stat().st_size
+    ]
 
 
 def _check_replaceable(folder: Path, overwrite: bool, file: Path) -> None:
@@ -77,28 +84,15 @@ def _check_replaceable(folder: Path, overwrite: bool, file: Path) -> None:
         )
 
 
-def remove_links(folder: Path) -> None:
-    """Remove links that bear the names of a run's files and folders; what they lead to stays as it is.
-
-    Raises:
-        OutputError: If one cannot be removed.
-    """
-    with writing(folder):
-        for path in layout.run_folders(
-            folder
-        ):  # the outer ones first: what is within a linked one is elsewhere
-            if path.is_symlink():
-                path.unlink()
-        for path in layout.top_files(folder):
-            if path.is_symlink():
-                path.unlink()
-
-
 def _is_foreign(path: Path) -> bool:
-    """Whether a file or folder is neither a run's nor hidden; an empty folder of a run is a run's."""
+    """Whether a visible file or folder is not a run's; an empty folder with the name of a run's is one of a run."""
     folder = path.parent
-    if path.name.startswith(".") or path.name in _SYSTEM or path in layout.top_files(folder):
+    if path.name.startswith(".") or path.name in _SYSTEM:
         return False
-    if path.stem == layout.PICKED or path.name == layout.PARTS:
+    if path.name == layout.INDEX and (folder / "object_0").is_dir():
         return False
-    return path.is_symlink() or path not in layout.run_folders(folder) or any(path.iterdir())
+    if path.is_symlink() or not path.is_dir():
+        return path.is_symlink() or path.stem != layout.PICKED
+    if path.name in (layout.PICKED, layout.PARTS) or layout.is_object_name(path.name):
+        return False
+    return path not in layout.run_folders(folder) or any(path.iterdir())

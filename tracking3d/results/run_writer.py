@@ -32,7 +32,7 @@ from tracking3d.results.files import (
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.overwrite import check_run_folder, clear_run_folder
+from tracking3d.results.overwrite import check_output_folder, clear_run_folder
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
@@ -81,7 +81,7 @@ class RunWriter:
         self._description = description.description_at_start(header)
         self._kept: dict[int, FrameRecord] = {}
         if resume is None:
-            check_run_folder(self.folder, overwrite)
+            check_output_folder(self.folder, overwrite)
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             if resume is None and (self.folder / layout.FRAMES).is_symlink():
