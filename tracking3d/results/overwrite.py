@@ -24,11 +24,11 @@ def check_output_folder(folder: Path, overwrite: bool) -> None:
     with writing(folder):
         if overwrite or not folder.is_dir():
             return
-        other: Path | None = folder / layout.FRAMES
-        if not other.is_symlink():  # a link would be written through
-            if layout.run_files(folder):
-                return
-            other = next((path for path in sorted(folder.iterdir()) if _is_foreign(path)), None)
+        lines = folder / layout.FRAMES
+        linked = lines.is_symlink()  # it would be written through
+        if not linked and layout.run_files(folder):
+            return
+        other = lines if linked else next(filter(_is_foreign, sorted(folder.iterdir())), None)
     if other is not None:
         raise OutputError(
             f"{folder} holds {other.name}, which is no part of a run; choose another {layout.OUT}, or pass "
