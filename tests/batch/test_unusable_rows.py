@@ -32,6 +32,7 @@ JSON_ROWS = {
     "settings of brackets": json.dumps(
         {"video": "one.mp4", "box": BOX, "settings": "solver.iterations=" + "[" * DEEP}
     ),
+    "brackets for a video": '{"video": ' + "[" * 900 + "]" * 900 + "}",
     "no object": "[1, 2]",
     "no JSON": '{"video": "one.mp4"',
     "not UTF-8": b'{"video": "caf\xe9.mp4", "box": "1,2,3,4"}',

@@ -41,7 +41,7 @@ def read_table(place: str) -> list[VideoRow | UnusableRow]:
             read_values = _csv(content)
         else:
             read_values = _json_lines(content)
-        found = [(number, values) for number, values in read_values]
+        found = list(read_values)
     except (ValueError, csv.Error, RecursionError) as error:
         raise InputError(f"The table {place} cannot be read ({error}).") from error
     if not found:
@@ -55,13 +55,15 @@ def read_table(place: str) -> list[VideoRow | UnusableRow]:
             if not known and suffix in _WITH_COLUMNS:  # wrong in every row
                 raise
             video = values.get("video") if isinstance(values, dict) else None
-            rows.append(UnusableRow(number, printable(str(video or "")), str(error)))
-    if all(isinstance(row, UnusableRow) for row in rows):
-        raise InputError(rows[0].reason)
+            video = printable(video) if isinstance(video, str) else ""
+            rows.append(UnusableRow(number, video, str(error)))
+    first = rows[0]
+    if isinstance(first, UnusableRow) and all(isinstance(row, UnusableRow) for row in rows):
+        raise InputError(first.reason)
     return rows
 
 
-def _row(values: dict[str, Any] | ValueError, where: str) -> VideoRow:
+def _row(values: Any, where: str) -> VideoRow:
     """The row of what a line holds, or of why it could not be read.
 
     Raises:
