@@ -133,8 +133,18 @@ def test_what_is_wrong_with_a_table_is_said_with_its_place(videos, text, words):
     assert all(word in str(error.value) for word in words)
 
 
-def test_what_is_wrong_with_a_file_beside_a_video_is_said(videos):
-    (videos / "one.json").write_text("[1]")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1]",
+        "[" * 100_000,
+        '{"box": "1,2,3,4\\u0000"}',
+        '{"name": "\\ud800"}',
+        '{"split": 1' + 400 * "0" + "}",
+    ],
+)
+def test_what_is_wrong_with_a_file_beside_a_video_is_said(videos, text):
+    (videos / "one.json").write_text(text)
     with pytest.raises(InputError, match=r"one\.json"):
         jobs_of(videos)
 

@@ -12,9 +12,11 @@ import pytest
 
 from tracking3d.batch import folder as batch_folder
 from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
+from tracking3d.batch.running import run_batch
 from tracking3d.batch.storage import _open
 from tracking3d.batch.summary import COLUMNS, MARKER
 from tracking3d.config.loading import load_config
+from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results.lock import try_lock
 from tracking3d.results.run_reader import RunReader
@@ -85,6 +87,13 @@ def test_a_folder_that_no_batch_has_written_is_left_alone(batch, videos, tmp_pat
     progress, _ = batch(videos)
     assert (progress.finished, progress.failed) == (1, 1) and mine.read_text() == "mine"
     assert "not written by a batch" in read_failures(str(tmp_path / "out"))[0].reason
+
+
+def test_a_batch_is_not_written_into_the_root_of_a_file_system(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "mkdir", lambda *given, **named: pytest.fail("a folder was made"))
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="is the root of a file system"):
+            run_batch([], tmp_path.anchor, InThisProcess(), overwrite=overwrite)
 
 
 def test_a_video_that_fails_once_goes_on_where_it_was(batch, videos, recorded, tmp_path):

@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from large_arrays import memory_stays_below, write_zeros
 
 from tracking3d import Frame, Session, load_config
+from tracking3d.checkpoint import serialization
 from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.checkpoint.milestones import _compress
 from tracking3d.checkpoint.progress import JournalEntry, RunProgress, checksum
 from tracking3d.checkpoint.serialization import INLINE, NotSerializableError, TreeFolder
 from tracking3d.errors import InputError
@@ -180,6 +183,60 @@ def test_what_nobody_has_named_is_refused(tmp_path, value):
 def test_what_was_tampered_with_is_no_tree(tmp_path, node):
     with pytest.raises(ValueError):
         TreeFolder(tmp_path, CLASSES).read(node)
+
+
+@pytest.mark.parametrize("kind", ["array", "sparse"])
+@pytest.mark.parametrize(
+    "name", ["../00000000.npz", "/etc/00000000.npz", "notes.npz", "link", 7, None, ["00000000.npz"]]
+)
+def test_only_arrays_of_the_state_are_read_and_none_is_removed_elsewhere(tmp_path, name, kind):
+    inner = tmp_path / ".state"
+    inner.mkdir()
+    np.savez(tmp_path / "00000000.npz", array=LARGE, index=np.zeros((1, 1), int), value=np.zeros(1))
+    (inner / "00000007.npz").symlink_to(tmp_path / "00000000.npz")
+    place = "00000007.npz" if name == "link" else name
+    node = {
+        "array": {"array": "<f4", "shape": [40, 30], "file": place},
+        "sparse": {"sparse": {"file": place}, "size": [3]},
+    }
+    folder = TreeFolder(inner, CLASSES)
+    with pytest.raises(ValueError, match="no file of this state"):
+        folder.read(node[kind])
+    folder.tidy()
+    assert (tmp_path / "00000000.npz").is_file()
+
+
+@pytest.mark.parametrize(("name", "count"), [("array", 2**27), ("bits", 2**30), ("bits", 2**22)])
+def test_the_arrays_of_a_tree_take_little_more_than_their_files(tmp_path, monkeypatch, name, count):
+    monkeypatch.setattr(serialization, "MOST_COMPRESSED", 2**20)
+    write_zeros(tmp_path / "00000000.npz", **{name: (count // 8 if name == "bits" else count,)})
+    with memory_stays_below(2**22), pytest.raises(ValueError, match="more memory than those of a state"):
+        TreeFolder(tmp_path, CLASSES).read({"array": "|u1", "shape": [count], "file": "00000000.npz"})
+
+
+def test_many_small_files_of_large_arrays_are_counted_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(serialization, "MOST_COMPRESSED", 2**20)
+    nodes = []
+    for number in range(4):
+        write_zeros(tmp_path / f"{number:08d}.npz", array=(2**19,))
+        nodes.append({"array": "|u1", "shape": [2**19], "file": f"{number:08d}.npz"})
+    assert len(TreeFolder(tmp_path, CLASSES).read(nodes[:2])) == 2
+    with pytest.raises(ValueError, match="more memory than those of a state"):
+        TreeFolder(tmp_path, CLASSES).read(nodes)
+
+
+@pytest.mark.parametrize("value", [LARGE, np.zeros((64, 80)), np.zeros((300, 400), bool)])
+def test_the_compressed_arrays_of_a_rollback_point_come_back(tmp_path, value):
+    text = TreeFolder(tmp_path, CLASSES).text(value)
+    _compress(tmp_path / "00000000.npz")
+    assert_same(TreeFolder(tmp_path, CLASSES).read(json.loads(text)), value)
+
+
+@pytest.mark.parametrize("shape", [[10**12], [-5], [2**40, 2**40]])
+def test_bits_are_as_many_as_the_state_says(tmp_path, shape):
+    np.savez(tmp_path / "00000000.npz", bits=np.zeros(9, np.uint8))
+    with pytest.raises(ValueError, match="another array than was saved"):
+        TreeFolder(tmp_path, CLASSES).read({"array": "|b1", "shape": shape, "file": "00000000.npz"})
 
 
 def test_a_damaged_array_is_told(tmp_path):

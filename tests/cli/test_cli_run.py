@@ -304,6 +304,24 @@ def test_folder_with_a_run_is_refused_unless_it_may_be_overwritten(call, refused
     assert len(RunReader(Path("run")).frames) == 2
 
 
+def test_folders_of_other_files_need_to_be_confirmed_and_a_root_is_refused(
+    call, refused, clip, script, monkeypatch
+):
+    Path("mine").mkdir()
+    Path("mine/notes.txt").write_text("mine")
+    for more in ((), ("--resume",), ("--box", "5,5,20,20")):
+        line = refused("run", clip, *BOX, "--out", "mine", *more)
+        assert "mine holds notes.txt" in line and line.endswith(
+            "pass --overwrite to write the run next to it."
+        )
+    assert [path.name for path in Path("mine").iterdir()] == ["notes.txt"] and not script.built
+    assert call("run", clip, *BOX, "--out", "mine", "--overwrite").exit_code == 0
+    assert Path("mine/notes.txt").read_text() == "mine" and len(RunReader(Path("mine")).frames) == 5
+    monkeypatch.setattr(Path, "mkdir", lambda *given, **named: pytest.fail("a folder was made"))
+    for more in ((), ("--overwrite",), ("--resume",), ("--box", "5,5,20,20")):
+        assert "is the root of a file system" in refused("run", clip, *BOX, "--out", Path.cwd().anchor, *more)
+
+
 def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path):
     (tmp_path / "file").write_text("")
     assert "file" in refused("run", clip, *BOX, "--out", "file")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from large_arrays import memory_stays_below, write_zeros
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -421,10 +422,24 @@ def test_numpy_scalars_and_plain_values_are_read(truth, tmp_path):
 def test_arrays_of_objects_are_refused(truth, tmp_path):
     arrays = tapvid_arrays(truth)
     arrays["points"] = arrays["points"].astype(object)
-    with pytest.raises(InputError, match=r"points .* not an array of numbers"):
+    with pytest.raises(InputError, match=r"an array of type O8, but only numbers and texts are read"):
         answers_from_tapvid(write_pickle(tmp_path / "t.pkl", arrays), truth)
     np.savez(tmp_path / "t.npz", **arrays)
     with pytest.raises(InputError, match="cannot be read as plain arrays"):
+        answers_from_tapvid(tmp_path / "t.npz", truth)
+
+
+def test_the_video_in_a_file_of_tracks_is_not_read(truth, tmp_path):
+    np.savez(tmp_path / "t.npz", **tapvid_arrays(truth, (64, 48)))
+    write_zeros(tmp_path / "t.npz", video=(2**14, 48, 64, 3))
+    with memory_stays_below(2**24):
+        positions, _ = answers_from_tapvid(tmp_path / "t.npz", truth).points(0, truth.points.positions[0])
+    np.testing.assert_allclose(positions, truth.points.positions, atol=1e-3)
+
+
+def test_more_tracks_than_a_frame_has_pixels_are_refused_before_they_are_read(truth, tmp_path):
+    write_zeros(tmp_path / "t.npz", points=(2**23, COUNT, 2), occluded=(2**23, COUNT))
+    with memory_stays_below(2**24), pytest.raises(InputError, match=r"t\.npz has more tracks than"):
         answers_from_tapvid(tmp_path / "t.npz", truth)
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 
 import engine_tasks as tasks
 import pytest
 
+from tracking3d.engines import on_ray
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.on_ray import RayEngine
 from tracking3d.engines.protocol import Began, Needs, Task, Told
+from tracking3d.errors import InputError
 
 pytestmark = [
     pytest.mark.slow,
@@ -86,3 +89,12 @@ def test_a_node_that_goes_costs_nothing_but_time(ray, here, tmp_path):
     assert removed
     assert [ended[n].fault for n in range(6)] == [None] * 6
     assert max(one.attempts for one in ended.values()) >= 2
+
+
+def test_a_server_that_is_no_ray_is_told_in_a_sentence(ray, monkeypatch, capfd):
+    monkeypatch.setattr(on_ray, "RESPONSE", 3.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(InputError, match="no response in 3 seconds"), open_engine(address, 2):
+            pass
+    assert capfd.readouterr() == ("", "")

@@ -180,17 +180,103 @@ def test_who_says_nothing_is_not_waited_for(session, monkeypatch):
         picker.close()
 
 
+@pytest.mark.parametrize(
+    "beginning", [b"", b"GET / HTTP/1.1\r\nX-A: ", request("POST", "/mask", Content_Length="5000")]
+)
+def test_a_request_that_trickles_in_is_ended_however_often_something_comes(session, monkeypatch, beginning):
+    monkeypatch.setattr(server_module._Handler, "timeout", 0.3)
+    picker = Picker(session, lambda picked: ("", ""), Access(), 0)
+    until, ended = time.monotonic() + 10, False
+    try:
+        with socket.create_connection(("127.0.0.1", picker.port), timeout=0.05) as connection:
+            connection.sendall(beginning)
+            while not ended and time.monotonic() < until:
+                try:
+                    connection.sendall(b"x")
+                    ended = connection.recv(100) == b""
+                except TimeoutError:
+                    continue
+                except ConnectionError:
+                    ended = True
+    finally:
+        picker.close()
+    assert ended
+
+
+SLOW = {
+    "silent": b"",
+    "without an end of the header": b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ",
+    "without an end of the body": request("POST", "/mask", Content_Length="5000") + b"{",
+    "with a wrong token": request("POST", "/mask?token=wrong", Content_Length="5000") + b"{",
+}
+
+
+@pytest.mark.parametrize("token", ["", "secret"])
+@pytest.mark.parametrize("kind", SLOW)
+def test_slow_connections_shut_nobody_out(session, monkeypatch, kind, token):
+    monkeypatch.setattr(server_module._Handler, "timeout", 300.0)
+    picker = Picker(session, lambda picked: ("", ""), Access("127.0.0.1", token), 0)
+    slow = []
+    try:
+        for _ in range(MOST_CONNECTIONS + 8):
+            slow.append(socket.create_connection(("127.0.0.1", picker.port), timeout=20))
+            with contextlib.suppress(ConnectionError):
+                slow[-1].sendall(SLOW[kind])
+        for _ in range(3):
+            assert status(whole(picker, request("GET", f"/?token={token}"))) == (303 if token else 200)
+            cookie = f"tracking3d_{picker.port}={token}"
+            assert status(post(picker, "/mask", BOX, Cookie=cookie)) == 200
+    finally:
+        for one in slow:
+            one.close()
+        picker.close()
+
+
+def test_who_knows_the_token_gives_way_to_nobody_who_does_not(session):
+    picker = Picker(session, lambda picked: ("", ""), Access("127.0.0.1", "secret"), 0)
+    content = json.dumps(BOX).encode()
+    text = request("POST", "/mask", content, Cookie=f"tracking3d_{picker.port}=secret")
+    waiting = []
+    try:
+        with socket.create_connection(("127.0.0.1", picker.port), timeout=20) as connection:
+            connection.sendall(text[: -len(content)] + content[:1])
+            until = time.monotonic() + 20
+            while not picker._server.connections._settled and time.monotonic() < until:
+                time.sleep(0.01)
+            for _ in range(2 * MOST_CONNECTIONS):
+                waiting.append(socket.create_connection(("127.0.0.1", picker.port), timeout=20))
+            for one in waiting[:MOST_CONNECTIONS]:  # the rest of them are waited for still
+                with contextlib.suppress(ConnectionError):
+                    assert one.recv(1) == b""
+            connection.sendall(content[1:])
+            assert status(connection.recv(65536)) == 200
+    finally:
+        for one in waiting:
+            one.close()
+        picker.close()
+
+
 @pytest.mark.parametrize("count", [2 * MOST_CONNECTIONS, pytest.param(1000, marks=pytest.mark.slow)])
-def test_a_crowd_is_turned_away_and_when_it_has_gone_the_page_is_served(picker, count):
+def test_of_a_crowd_the_earliest_are_turned_away_and_the_page_is_served(picker, count):
     waiting = []
     for _ in range(count):
         waiting.append(socket.create_connection(("127.0.0.1", picker.port), timeout=20))
-    for one in waiting[MOST_CONNECTIONS:]:
+    for one in waiting[:-MOST_CONNECTIONS]:
         with contextlib.suppress(ConnectionError):
             assert one.recv(1) == b""
+    assert status(whole(picker, request("GET", "/"))) == 200
     for one in waiting:
         one.close()
-    until = time.monotonic() + 20
-    while time.monotonic() < until and status(raw_request(picker.port, request("GET", "/"))) != 200:
-        time.sleep(0.05)
+    assert status(whole(picker, request("GET", "/"))) == 200
+
+
+def test_where_all_are_worked_on_a_newcomer_is_turned_away(picker):
+    ends = [socket.socketpair() for _ in range(MOST_CONNECTIONS)]
+    connections = picker._server.connections
+    for ours, _ in ends:
+        assert connections.add(ours) and connections.settle(ours)
+    assert raw_request(picker.port, request("GET", "/")) == b""
+    for ours, theirs in ends:
+        connections.remove(ours)
+        ours.close(), theirs.close()
     assert status(whole(picker, request("GET", "/"))) == 200

@@ -138,9 +138,9 @@ def test_the_second_look_has_its_own_stages(source, clip, tmp_path):
 
 def test_several_objects_share_what_a_frame_takes_to_decode(source, clip, tmp_path):
     masks = [clip.masks[0], clip.masks[0]]
-    record_objects(source, settings("rerendering"), tmp_path, masks=masks)
+    record_objects(source, settings("rerendering"), tmp_path / "run", masks=masks)
     for folder in ("object_0", "object_1"):
-        for frame in RunReader(tmp_path / folder).frames:
+        for frame in RunReader(tmp_path / "run" / folder).frames:
             assert slept(frame.stages.decode, DECODING / 2)
             assert slept(frame.stages.track, TRACKING)
 

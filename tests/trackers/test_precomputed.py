@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from large_arrays import memory_stays_below, write_zeros
 from PIL import Image as Pillow
 from pydantic import ValidationError
 
@@ -273,3 +274,23 @@ def test_a_frame_before_the_start_is_a_plugin_error(tmp_path: Path) -> None:
     tracker = PrecomputedMasks.from_options(PrecomputedMasks.Options(path=str(tmp_path)))
     with pytest.raises(PluginError):
         tracker.step(frame(0))
+
+
+def test_masks_in_an_archive_are_decompressed_one_at_a_time(tmp_path: Path) -> None:
+    """The archive has under 1 MB; its masks together would take 157 MB."""
+    write_zeros(tmp_path / "m.npz", masks=(512, 480, 640))
+    with memory_stays_below(2**26):
+        estimates = track(tmp_path / "m.npz", [frame(0), frame(400), frame(3)])
+    assert all("is empty" in estimate.reason for estimate in estimates)
+
+
+@pytest.mark.parametrize("shape", [(1, 2**14, 2**13 + 1), (2**14, 2**13 + 1)], ids=["stack", "frame"])
+def test_masks_larger_than_a_frame_can_be_are_refused_before_they_are_read(tmp_path: Path, shape) -> None:
+    write_zeros(tmp_path / "m.npz", masks=shape)
+    with memory_stays_below(2**24), pytest.raises(InputError, match=r"m\.npz holds masks that are larger"):
+        PrecomputedMasks.from_options(PrecomputedMasks.Options(path=str(tmp_path / "m.npz")))
+
+
+def test_a_stack_in_fortrans_order_is_read_too(tmp_path: Path) -> None:
+    np.savez(tmp_path / "m.npz", np.asfortranarray(np.stack([truth(index) for index in range(3)])))
+    assert_truth(track(tmp_path / "m.npz", [frame(2), frame(0)]), [2, 0])

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import posixpath
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from tracking3d.batch.one_video import LOGS
-from tracking3d.batch.rows import VideoRow
+from tracking3d.batch.rows import UnusableRow, VideoRow
 from tracking3d.batch.sidecar_files import videos_of
 from tracking3d.batch.storage import absolute, is_folder, local, parent
 from tracking3d.batch.tables import is_table, read_table
@@ -44,19 +46,24 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
         split: Length of the parts that long videos are cut into, if a row does not give one; empty for none.
 
     Raises:
-        InputError: If there is nothing, a table cannot be read, or two videos would have one name.
+        InputError: If there is nothing, no row of a table can be used, or two videos would have one name.
     """
+    unusable: list[UnusableRow] = []
     if is_table(place):
-        rows = [(row, 0) for row in read_table(place)]
-        folder = absolute(parent(place))
-        rows = [(_absolute(row, folder), size) for row, size in rows]
-        root = ""
+        folder, root = absolute(parent(place)), ""
+        rows = []
+        for row in read_table(place):
+            if isinstance(row, UnusableRow):
+                unusable.append(row)
+            else:
+                rows.append((_absolute(row, folder), 0))
     else:
         root = absolute(place) if is_folder(place) else ""
         rows = [(_absolute(row, "."), size) for row, size in videos_of(place)]
     rows = _together(rows)
     names = _names([row for row, _ in rows], root)
-    return [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
+    jobs = [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
+    return jobs + [_job_of_unusable(row, names) for row in unusable]
 
 
 def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
@@ -102,9 +109,9 @@ def _together(rows: Sequence[tuple[VideoRow, int]]) -> list[tuple[VideoRow, int]
     """Rows that differ in the object only, as one."""
     groups: defaultdict[str, list[tuple[VideoRow, int]]] = defaultdict(list)
     for row, size in rows:
-        groups[row.model_copy(update={"box": (), "mask": (), "points": ()}).model_dump_json()].append(
-            (row, size)
-        )
+        # Not pydantic's JSON, which refuses paths that are not UTF-8.
+        key = json.dumps(row.model_dump(exclude={"box", "mask", "points"}))
+        groups[key].append((row, size))
     together = []
     for group in groups.values():
         objects: Mapping[str, Any] = {
@@ -170,14 +177,24 @@ def _within(video: str, root: str) -> str:
     return "/".join(part.lstrip(".") or "_" for part in path.parts) or "video"
 
 
+def _job_of_unusable(row: UnusableRow, names: Sequence[str]) -> VideoJob:
+    name = f"line_{row.number}"
+    while name in names:
+        name += "_"
+    return VideoJob(name, row.video, PipelineConfig(), fault=row.reason)
+
+
 def _job(row: VideoRow, name: str, size: int, configure: Configure, split: str) -> VideoJob:
     fault = "" if row.has_prompt else NO_PROMPT
     try:
         config = configure(row)
     except Tracking3dError as error:
         config, fault = PipelineConfig(), str(error)
-    if not fault and not size and (path := local(row.video)) is not None and path.is_file():
-        size = path.stat().st_size
+    except RecursionError:
+        config, fault = PipelineConfig(), f"The settings of {row.video} are nested too deeply."
+    if not fault and not size and (path := local(row.video)) is not None:
+        with suppress(OSError):
+            size = path.stat().st_size if path.is_file() else 0
     return VideoJob(
         name,
         row.video,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationError
@@ -15,6 +16,8 @@ from tracking3d.errors import InputError
 
 SEPARATOR = ";"
 """Between several values in one cell."""
+_LONGEST = 120  # characters of a text in a message
+_MOST = 10_000  # characters of a value; an error would quote all of them
 
 
 def _texts(value: Any) -> Any:
@@ -78,6 +81,21 @@ class VideoRow(Section):
         return bool(self.box or self.mask or self.points or self.masks)
 
 
+@dataclass(frozen=True)
+class UnusableRow:
+    """A row that cannot be used.
+
+    Attributes:
+        number: Its line.
+        video: Its video, as far as it can be printed.
+        reason: What is wrong with it, in a sentence that names the line.
+    """
+
+    number: int
+    video: str
+    reason: str
+
+
 def read_row(values: Mapping[str, Any], where: str) -> VideoRow:
     """A row from what a table or a JSON file holds; cells that are empty say nothing.
 
@@ -93,6 +111,55 @@ def read_row(values: Mapping[str, Any], where: str) -> VideoRow:
         return VideoRow.model_validate(given)
     except ValidationError as error:
         raise InputError(f"{where}: {describe_validation_error(error, VideoRow, 'column')}") from error
+    except (OverflowError, RecursionError) as error:
+        raise InputError(f"{where} holds a value that is too large or too deeply nested.") from error
+
+
+def check_texts(values: Mapping[str, Any], where: str) -> None:
+    """Check that texts from outside are texts: no path, table or page can hold others.
+
+    Args:
+        values: See `read_row`.
+        where: See `read_row`.
+
+    Raises:
+        InputError: If a text holds NUL or half of a character or is very long, or values are nested too deeply.
+    """
+    try:
+        for column, value in values.items():
+            for text in _texts_in((column, value)):
+                if "\0" in text:
+                    raise InputError(f"{where}: column {printable(column)} holds a NUL character; remove it.")
+                if len(text) > _MOST:
+                    raise InputError(
+                        f"{where}: column {printable(column)} has {len(text)} characters; shorten it."
+                    )
+                if not _is_unicode(text):
+                    raise InputError(
+                        f"{where}: column {printable(column)} is not valid Unicode; write the file as UTF-8."
+                    )
+    except RecursionError as error:
+        raise InputError(f"{where} holds a value that is too deeply nested.") from error
+
+
+def printable(text: str) -> str:
+    """A text for a message: with escapes for what cannot be printed, and no longer than a line."""
+    escaped = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text[:_LONGEST])
+    return escaped + "..." if len(text) > _LONGEST else escaped
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from _texts_in(tuple(value.items()))
+    elif isinstance(value, list | tuple):
+        for one in value:
+            yield from _texts_in(one)
+
+
+def _is_unicode(text: str) -> bool:
+    return not any("\ud800" <= sign <= "\udfff" for sign in text)
 
 
 def _empty(value: Any) -> bool:

@@ -22,6 +22,7 @@ from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
 from tracking3d.errors import OutputError
 from tracking3d.results.files import writing
+from tracking3d.results.layout import refuse_root
 from tracking3d.results.lock import try_lock
 
 _log = logging.getLogger(__name__)
@@ -313,6 +314,7 @@ def _alone(out: str) -> Iterator[None]:
     if folder is None:
         yield
         return
+    refuse_root(folder)
     with writing(folder):
         (folder / LOGS).mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("ab")

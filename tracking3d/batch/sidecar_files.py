@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from tracking3d.batch.rows import VideoRow, read_row
+from tracking3d.batch.rows import VideoRow, check_texts, read_row
 from tracking3d.batch.storage import base, is_folder, join_path, matches, names_in, parent, read
 from tracking3d.errors import InputError
 
@@ -89,8 +89,9 @@ def _from_json(file: str, video: str) -> VideoRow:
         values = json.loads(read(file) or b"")
         if not isinstance(values, dict):
             raise ValueError("it is not a JSON object")
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"{file} cannot be read ({error}); it must hold the same keys as a row of a table."
         ) from error
+    check_texts(values, file)
     return read_row({**values, "video": video}, file)

@@ -21,7 +21,12 @@ def local(place: str) -> Path | None:
     """The local path of a place; None if it is on other storage."""
     if place.startswith(_FILE):
         return Path(place.removeprefix(_FILE))
-    return None if "://" in place else Path(place).expanduser()
+    if "://" in place:
+        return None
+    try:
+        return Path(place).expanduser()
+    except RuntimeError:  # there is no such user: a folder may begin with ~ too
+        return Path(place)
 
 
 def absolute(place: str, folder: str = ".") -> str:

@@ -130,7 +130,7 @@ class Checkpoint:
             kept = SavedState(
                 RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
         return kept
 

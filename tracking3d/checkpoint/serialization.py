@@ -10,23 +10,27 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
-from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tracking3d.runtime.array_files import ArrayFile
+
 INLINE = 1024
 """Bytes from which on an array has a file of its own."""
+MOST_COMPRESSED = 2**30
+"""Bytes that the arrays of one tree may take beyond those of their files."""
 SUFFIX = ".npz"
+_KINDS = "biuf"
+_NAME = re.compile(r"\d{8,}\.npz")
 
 
 class NotSerializableError(TypeError):
@@ -78,6 +82,7 @@ class TreeFolder:
         self._next = max(numbers, default=-1) + 1
         self._root = _Part(None, "null")
         self._spared: set[str] = set()  # files of earlier trees that are needed still
+        self._left = MOST_COMPRESSED
 
     def text(self, tree: Any) -> str:
         """The tree as JSON text; arrays that are not in a file yet are written.
@@ -96,10 +101,10 @@ class TreeFolder:
         Raises:
             ValueError: If it is not one, or an array is missing or damaged.
         """
-        self._root = _Part(None, "")
+        self._root, self._left = _Part(None, ""), MOST_COMPRESSED
         try:
             return self._decode(node, self._root)
-        except (OSError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, RuntimeError) as error:
+        except (OSError, KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise ValueError(str(error) or type(error).__name__) from error
         finally:
             self._by_text.clear()
@@ -189,7 +194,7 @@ class TreeFolder:
         return f'{{"tensor": {text}, "axes": {axes}}}', file
 
     def _encode_array(self, array: NDArray[Any]) -> tuple[str, str | None]:
-        if array.dtype.kind not in "biuf":
+        if array.dtype.kind not in _KINDS:
             raise NotSerializableError(f"an array of {array.dtype} cannot be saved")
         about: dict[str, Any] = {"array": array.dtype.str, "shape": list(array.shape)}
         if array.nbytes < INLINE:
@@ -207,10 +212,20 @@ class TreeFolder:
         np.savez(self._folder / name, **arrays)  # type: ignore[arg-type]
         return name
 
-    def _open(self, name: str) -> NpzFile:
-        # From memory: numpy leaves a damaged file open.
-        opened: NpzFile = np.load(BytesIO((self._folder / name).read_bytes()), allow_pickle=False)
-        return opened
+    def _open(self, name: Any) -> ArrayFile:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or (self._folder / name).is_symlink():
+            raise ValueError(f"it names {name!r}, which is no file of this state")
+        return ArrayFile(self._folder / name)
+
+    def _read(self, arrays: ArrayFile, name: str) -> NDArray[Any]:
+        self._reserve(arrays.header(name).nbytes, arrays.bytes)
+        return arrays.read(name, arrays.header(name).nbytes)
+
+    def _reserve(self, size: int, expected: int) -> None:
+        """Count what an array takes beyond what is ``expected`` of its file; only rollback points are compressed."""
+        self._left -= max(size - expected, 0)
+        if self._left < 0:
+            raise ValueError("its arrays take more memory than those of a state")
 
     def _decode(self, node: Any, within: _Part) -> Any:
         if isinstance(node, list):
@@ -247,8 +262,8 @@ class TreeFolder:
 
     def _read_part(self, node: dict[str, Any], inner: dict[str, Any], text: str, file: str | None) -> _Part:
         if "sparse" in node:
-            with self._open(str(file)) as arrays:
-                index, value = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["value"])
+            with self._open(file) as arrays:
+                index, value = (torch.from_numpy(self._read(arrays, name)) for name in ("index", "value"))
             sparse = torch.sparse_coo_tensor(index, value, node["size"], check_invariants=True)
             return _Part(sparse.coalesce().to(self._device), text, file)
         array = self._array(inner)
@@ -259,13 +274,18 @@ class TreeFolder:
 
     def _array(self, node: dict[str, Any]) -> NDArray[Any]:
         kind, shape = np.dtype(node["array"]), tuple(node["shape"])
+        if kind.kind not in _KINDS:
+            raise ValueError(f"it holds an array of {kind}")
         if "data" in node:
             return np.frombuffer(base64.b64decode(node["data"]), kind).reshape(shape).copy()
         with self._open(node["file"]) as arrays:
-            if "bits" in arrays.files:
-                flat = np.unpackbits(arrays["bits"], count=math.prod(shape)).astype(kind)
-                return flat.reshape(shape)
-            found: NDArray[Any] = arrays["array"]
+            if "bits" in arrays.names:
+                bits, count = self._read(arrays, "bits"), math.prod(shape)
+                if not 0 <= count <= 8 * bits.size:
+                    raise ValueError(f"{node['file']} holds another array than was saved")
+                self._reserve(count * kind.itemsize, 8 * arrays.bytes * kind.itemsize)
+                return np.unpackbits(bits, count=count).astype(kind).reshape(shape)
+            found = self._read(arrays, "array")
         if found.shape != shape or found.dtype != kind:
             raise ValueError(f"{node['file']} holds another array than was saved")
         return found

@@ -194,6 +194,7 @@ def picked_in_browser(
     from tracking3d.picker.server import Picker
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
+    from tracking3d.results.overwrite import check_output_folder
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.selection import within
@@ -201,6 +202,7 @@ def picked_in_browser(
 
     if (folder / layout.RUN).exists() and not overwrite:
         raise OutputError(f"{folder} already holds a run; give --overwrite or choose another {layout.OUT}.")
+    check_output_folder(folder, overwrite)
     opened, selection = open_source(source, frames), parse_selection(frames)
     if not opened.repeatable:
         raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")

@@ -22,7 +22,6 @@ Everything but the frames may be absent.
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
+from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.trackers.crops import box_of
 from tracking3d.video.image_sequence import images_among
 
@@ -250,16 +250,18 @@ def _read_points(file: Path, frames: int) -> PointTruth | None:
     if not file.exists():
         return None
     try:
-        with file.open("rb") as data, np.load(data, allow_pickle=False) as arrays:
-            points = PointTruth(arrays["positions"].astype(np.float64), arrays["visible"].astype(bool))
-    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        with ArrayFile(file) as arrays:
+            positions, shape = arrays.header("positions").shape, arrays.header("visible").shape
+            if len(shape) != 2 or shape[0] != frames or positions != (*shape, 2):
+                raise InputError(
+                    f"{file}: positions must be (T, N, 2) and visible (T, N) for the clip's {frames} frames, "
+                    f"not {positions} and {shape}."
+                )
+            points = PointTruth(
+                arrays.read("positions").astype(np.float64), arrays.read("visible").astype(bool)
+            )
+    except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read as positions and visible ({error}); restore it.") from error
-    shape = points.visible.shape
-    if len(shape) != 2 or shape[0] != frames or points.positions.shape != (*shape, 2):
-        raise InputError(
-            f"{file}: positions must be (T, N, 2) and visible (T, N) for the clip's {frames} frames, "
-            f"not {points.positions.shape} and {shape}."
-        )
     if not np.isfinite(points.positions[points.visible]).all():
         raise InputError(f"{file}: a visible point has a position that is not finite; correct it.")
     return points

@@ -69,7 +69,10 @@ class DepthFile:
         Raises:
             InputError: If it is not a readable 16-bit image.
         """
-        image = cv2.imread(str(self.path), cv2.IMREAD_UNCHANGED)
+        try:  # by its bytes: OpenCV ends the process if a path is not UTF-8
+            image = cv2.imdecode(np.fromfile(self.path, np.uint8), cv2.IMREAD_UNCHANGED)
+        except (OSError, cv2.error):  # missing, or empty
+            image = None
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
             raise InputError(
                 f"The depth {self.path} is not a readable 16-bit grey image; restore or remove it."

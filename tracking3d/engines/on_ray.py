@@ -17,6 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from tracking3d.engines.cluster_check import fault_of_cluster
 from tracking3d.engines.processes import default_workers
 from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
 from tracking3d.engines.worker import call, last_words, threads_in_words
@@ -27,6 +28,9 @@ THIS_MACHINE = "local"
 
 GRACE = 20.0
 """Seconds that a stopped task has to save its state."""
+
+RESPONSE = 20.0
+"""Seconds that a cluster has to respond."""
 
 _CALLS = 20
 """Number of tasks after which a worker is replaced, to release memory held by libraries."""
@@ -50,7 +54,7 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
         needs: What each takes.
 
     Raises:
-        InputError: If Ray is not installed, or nothing estimates at the address.
+        InputError: If Ray is not installed, or no cluster responds at the address within `RESPONSE`.
     """
     os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
     ray = _ray()
@@ -63,15 +67,13 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
         begun |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _OBJECT_STORE}
     else:
         begun["address"] = address
+        if fault := fault_of_cluster(address, RESPONSE):
+            raise _no_cluster(address, fault)
     with _signals_kept():
         try:
             ray.init(**begun)
         except Exception as error:  # a cluster can be out of reach in many ways
-            raise InputError(
-                f"No Ray cluster responds at --address {address} ({' '.join(str(error).split())[:200]}); "
-                "give auto on a "
-                f"machine of the cluster, HOST:PORT, ray://HOST:PORT, or {THIS_MACHINE}."
-            ) from error
+            raise _no_cluster(address, str(error)) from error
     _silence()
     try:
         yield RayEngine(workers, needs)
@@ -226,6 +228,13 @@ def _call_remotely(mailbox: Any, task: Task, threads: int, folder: str) -> tuple
         os.chdir(folder)
     mailbox.put.remote(task.number, ray.util.get_node_ip_address(), None)
     return call(task, lambda content: mailbox.put.remote(task.number, "", content), threads)
+
+
+def _no_cluster(address: str, fault: str) -> InputError:
+    return InputError(
+        f"No Ray cluster responds at --address {address} ({' '.join(fault.split())[:200].rstrip('.')}); give auto on a "
+        f"machine of the cluster, HOST:PORT, ray://HOST:PORT, or {THIS_MACHINE}."
+    )
 
 
 def _silence() -> None:

@@ -10,12 +10,13 @@ import yaml
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.picker.session import Picked
+from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, write_mask, writing
 from tracking3d.video import parse_selection
 
-FOLDER = "picked"
+FOLDER = layout.PICKED
 """Name of the file with the drawn masks in the run folder."""
-DESCRIPTION, SETTINGS = "picked.json", "picked.yaml"
+DESCRIPTION, SETTINGS = f"{FOLDER}.json", f"{FOLDER}.yaml"
 
 
 def save_outcome(picked: Picked, config: PipelineConfig, folder: Path, source: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import threading
@@ -21,13 +22,14 @@ from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
 from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words
 from tracking3d.web.access import SAFE_HEADERS, Access
+from tracking3d.web.connections import Connections, TimedReader
 
 LARGEST_BODY = 2 * 2**20
 """Bytes that a request may bring: every stroke of every object."""
 MOST_CONNECTIONS = 32
 """Requests that are worked on at a time; a browser needs a few."""
 PATIENCE = 15.0
-"""Seconds that a request may take to arrive."""
+"""Seconds that a request may take to arrive, and its response to be taken."""
 _POLL = 0.05  # seconds until it is seen that the server is to stop
 _PORTS = 100  # that are tried, from the wanted one on
 _FRAME = re.compile(r"/frame/(\d{1,9})\.jpg")
@@ -127,18 +129,18 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], picker: Picker) -> None:
         self.picker = picker
-        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.connections = Connections(MOST_CONNECTIONS)
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a request in a thread, or close the connection if there are too many."""
-        if not self._free.acquire(blocking=False):
+        if not self.connections.add(request):
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:
-            self._free.release()
+            self.connections.remove(request)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -146,7 +148,7 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self.connections.remove(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that went away is no news."""
@@ -156,6 +158,12 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = PATIENCE
     server: _Server
     server_version, sys_version = "tracking3d", ""
+
+    def setup(self) -> None:
+        """Limit the time of the whole request."""
+        super().setup()
+        self.rfile.close()
+        self.rfile = io.BufferedReader(TimedReader(self.connection, self.timeout))
 
     def do_GET(self) -> None:
         if not self._may(from_page=False):
@@ -192,7 +200,7 @@ class _Handler(BaseHTTPRequestHandler):
         then()
 
     def _may(self, from_page: bool) -> bool:
-        """Whether the request is allowed; if not, it is refused."""
+        """Whether the request is allowed; if not, it is refused before anything else of it is read."""
         picker = self.server.picker
         refusal = picker.access.refusal(
             self.path,
@@ -204,7 +212,12 @@ class _Handler(BaseHTTPRequestHandler):
         )
         if refusal is not None:
             self._refuse(*refusal)
-        return refusal is None
+            return False
+        # Only the token tells a person from somebody else, who may send the rest of the request slowly.
+        return self._settle() if picker.access.token or not from_page else True
+
+    def _settle(self) -> bool:
+        return self.server.connections.settle(self.connection)
 
     def _one(self, name: str) -> str | None:
         values = self.headers.get_all(name) or []
@@ -221,17 +234,19 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large.")
         else:
             body = self.rfile.read(int(told))
-            return body if len(body) == int(told) else None  # a browser that went away in the middle
+            # Else a browser went away in the middle.
+            return body if len(body) == int(told) and self._settle() else None
         return None
 
     def _send_json(self, told: Any) -> None:
         self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _refuse(self, status: HTTPStatus, reason: str) -> None:
-        self._send(status, (reason + "\n").encode(), "text/plain; charset=utf-8")
+        self._send(status, (reason + "\n").encode("utf-8", "replace"), "text/plain; charset=utf-8")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str = "text/plain", **headers: str) -> None:
         self.close_connection = True
+        self.connection.settimeout(self.timeout)
         self.send_response(status)
         every = {**SAFE_HEADERS, "Content-Security-Policy": _POLICY, **headers}
         every |= {"Content-Type": kind, "Content-Length": str(len(body))}

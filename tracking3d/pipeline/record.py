@@ -33,6 +33,7 @@ from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.description import RunHeader
 from tracking3d.results.given_masks import keep_given_masks
 from tracking3d.results.layout import object_folders
+from tracking3d.results.overwrite import check_output_folder
 from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
@@ -185,6 +186,7 @@ def record_tracking(
     """
     folder, prompts = validate_folder(folder), request.prompts
     folders = object_folders(folder, len(prompts)) if prompts.as_lists else [folder]
+    check_output_folder(folder, options.overwrite)
     with (
         open_tracking(request, folders[0] if options.resume else None) as opened,
         ExitStack() as writers,

@@ -35,13 +35,14 @@ def draw_outline(image: Image, mask: NDArray[np.bool_], colour: Colour, thicknes
 def draw_text(image: Image, text: str, left: int, base: int, height: int, colour: Colour) -> int:
     """Write ``text`` on the line ``base``, capitals ``height`` pixels high; gives the column of its end."""
     weight = max(round(height / 10), 1)
-    cv2.putText(image, text, (left, base), _FONT, height / _CAPITAL, colour, weight, cv2.LINE_AA)
+    cv2.putText(image, _encodable(text), (left, base), _FONT, height / _CAPITAL, colour, weight, cv2.LINE_AA)
     return left + text_width(text, height)
 
 
 def text_width(text: str, height: int) -> int:
     """Width in pixels of ``text`` as `draw_text` draws it."""
-    return int(cv2.getTextSize(text, _FONT, height / _CAPITAL, max(round(height / 10), 1))[0][0])
+    weight = max(round(height / 10), 1)
+    return int(cv2.getTextSize(_encodable(text), _FONT, height / _CAPITAL, weight)[0][0])
 
 
 def shorten(text: str, height: int, width: int) -> str:
@@ -84,6 +85,11 @@ def wrap(text: str, height: int, width: int, most: int) -> list[str]:
 def _fits(text: str, height: int, width: int) -> bool:
     """Whether ``text`` and the sign that some is left out fit."""
     return text_width(text + "...", height) <= width
+
+
+def _encodable(text: str) -> str:
+    """The text with ``?`` for what UTF-8 does not have, such as bytes of a path; OpenCV would end the process."""
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def fit(image: Image, size: int) -> Image:

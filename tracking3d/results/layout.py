@@ -25,6 +25,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from tracking3d.errors import OutputError, argument
@@ -43,6 +44,10 @@ REFINING = ".refining"
 STATE = ".state"
 PROMPTS = "prompts"
 CORRECTING = ".correcting"
+PARTS = "parts"
+"""The parts of a video that is tracked in parts, until they are merged."""
+PICKED = "picked"
+"""What was drawn before the run: masks in a folder of this name, and files with its name and a suffix."""
 DRAWN = ".drawn.png"
 """A mask drawn in the viewer, saved until its correction has started."""
 STATE_FILE = "state.json"
@@ -104,12 +109,24 @@ def initial_mask_path(folder: Path, index: int) -> Path:
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
+def refuse_root(folder: Path) -> None:
+    """Refuse to write into the root of a file system.
+
+    Raises:
+        OutputError: If ``folder`` is one.
+    """
+    with suppress(OSError):  # it does not exist yet
+        if folder.samefile(folder.absolute().anchor):
+            raise OutputError(f"{folder} is the root of a file system; give a folder in it as {OUT}.")
+
+
 def object_folders(folder: Path, count: int) -> list[Path]:
     """The run folders of ``count`` objects that are tracked through one video.
 
     Raises:
         OutputError: If ``folder`` is the run folder of one object, or holds more objects.
     """
+    refuse_root(folder)
     if (folder / RUN).exists():
         raise OutputError(f"{folder} holds a run of one object; choose another {OUT} for several.")
     if (more := folder / f"object_{count}").exists():
@@ -130,7 +147,12 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def _is_object(folder: Path) -> bool:
-    return folder.name.removeprefix("object_").isdecimal() and (folder / RUN).is_file()
+    return is_object_name(folder.name) and (folder / RUN).is_file()
+
+
+def is_object_name(name: str) -> bool:
+    """Whether a folder's name is that of one of several objects."""
+    return name.startswith("object_") and name.removeprefix("object_").isdecimal()
 
 
 def partial_path(path: Path) -> Path:
@@ -157,6 +179,13 @@ def run_files(folder: Path) -> list[Path]:
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
     return _add_unfinished(named) + state_files(folder) + correction_files(folder)
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """The folders within a run folder, whether they are there or not; outer ones first."""
+    inner = (CAUSAL, ONLINE, REFINING, STATE, CORRECTING, PARTS, MASKS, INITIAL_MASKS, PROBABILITIES, PROMPTS)
+    within = ((CAUSAL, MASKS), (REFINING, MASKS), (REFINING, PROBABILITIES), (STATE, MASKS))
+    return [folder / name for name in inner] + [folder / outer / name for outer, name in within]
 
 
 def correction_files(folder: Path) -> list[Path]:
@@ -193,4 +222,5 @@ def state_files(folder: Path) -> list[Path]:
 
 
 def _add_unfinished(files: list[Path]) -> list[Path]:
-    return [path for file in files for path in (file, partial_path(file)) if path.is_file()]
+    both = [path for file in files for path in (file, partial_path(file))]
+    return [path for path in both if path.is_file() or path.is_symlink()]

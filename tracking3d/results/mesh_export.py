@@ -28,6 +28,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import image_file, write_atomic, write_together
 from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
+from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.runtime.interruption import interrupts_deferred
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
@@ -240,13 +241,9 @@ def load_model(folder: Path) -> ObjectModel:
     """
     path = _existing(folder / FEATURES)
     try:
-        # From memory: numpy leaves a damaged file open.
-        with (
-            np.load(io.BytesIO(path.read_bytes())) as arrays,
-            PillowImage.open(folder / TEXTURE) as image,
-        ):
+        with ArrayFile(path) as arrays, PillowImage.open(folder / TEXTURE) as image:
             texture: NDArray[np.uint8] = np.asarray(image.convert("RGB"))
-            return ObjectModel(texture=texture, **{name: arrays[name] for name in arrays.files})
+            return ObjectModel(texture=texture, **{name: arrays.read(name) for name in arrays.names})
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(
             f"The model {path} cannot be read ({error}); track again into another {OUT}."

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -38,10 +37,12 @@ from tracking3d.results.image_points import follow_beside_mesh, read_run_images,
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
+from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.video import FrameSource
 
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+_LONGEST_KEY = 1024  # bytes
+_DAMAGED = (OSError, ValueError)
 _VERSION = 1  # of the saved file; another one is computed again
 
 
@@ -184,8 +185,8 @@ def has_landmarks(run: RunReader) -> bool:
     """
     file = run.mesh_folder / layout.LANDMARKS
     try:
-        with np.load(file, allow_pickle=False) as kept:
-            key = str(kept["key"])
+        with ArrayFile(file) as kept:
+            key = str(kept.read("key", _LONGEST_KEY))
     except _DAMAGED:
         return False
     return key == _key(run, _surface(run)[0], ROUNDS)
@@ -195,8 +196,11 @@ def read_landmarks(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.floa
     """Surface ``(V, 3)`` and poses ``(T, 4, 4)`` of the landmarks that are saved for a run as it is, or None."""
     if not has_landmarks(run):
         return None
-    with np.load(run.mesh_folder / layout.LANDMARKS, allow_pickle=False) as kept:
-        return kept["vertices"], kept["T_cam_obj"]
+    try:
+        with ArrayFile(run.mesh_folder / layout.LANDMARKS) as kept:
+            return kept.read("vertices"), kept.read("T_cam_obj")
+    except _DAMAGED:
+        return None
 
 
 def write_landmarks(run: RunReader, vertices: NDArray[np.float64], T_cam_obj: NDArray[np.float64]) -> None:
@@ -221,13 +225,14 @@ def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
 def _read_scene(file: Path, key: str, scene: LandmarkScene) -> LandmarkScene | None:
     """The scene with the saved surface and poses, if they are of the same run."""
     try:
-        with np.load(file, allow_pickle=False) as kept:
-            if str(kept["key"]) != key:
+        with ArrayFile(file) as kept:
+            shapes = [kept.header(name).shape for name in ("vertices", "T_cam_obj")]
+            if str(kept.read("key", _LONGEST_KEY)) != key:
                 return None
-            vertices, T = kept["vertices"], kept["T_cam_obj"]
+            if shapes != [scene.vertices.shape, (len(scene.views), 4, 4)]:
+                return None
+            vertices, T = kept.read("vertices"), kept.read("T_cam_obj")
     except _DAMAGED:
-        return None
-    if vertices.shape != scene.vertices.shape or T.shape != (len(scene.views), 4, 4):
         return None
     return scene.redrawn(vertices, dict(enumerate(T)))
 

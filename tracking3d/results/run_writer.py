@@ -34,7 +34,7 @@ from tracking3d.results.files import (
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.overwrite import clear_run_folder
+from tracking3d.results.overwrite import check_output_folder, clear_run_folder
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
@@ -86,8 +86,12 @@ class RunWriter:
         self._probabilities = bool(header.config.get("runtime", {}).get("probabilities"))
         self._description = description.description_at_start(header)
         self._kept: dict[int, FrameRecord] = {}
+        if resume is None:
+            check_output_folder(self.folder, overwrite)
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
+            if resume is None and (self.folder / layout.FRAMES).is_symlink():
+                (self.folder / layout.FRAMES).unlink()
         self._lines = FrameLines(self.folder)
         try:
             if resume is None:

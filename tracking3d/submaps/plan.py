@@ -22,7 +22,7 @@ from tracking3d.submaps.cuts import Part, cuts_in, overlap_of, parts_at, windows
 from tracking3d.submaps.preview import full_size, preview_video, tracker_for_looking
 from tracking3d.video.source import FrameSource
 
-PARTS = "parts"
+PARTS = layout.PARTS
 """Folder within that of the run in which the parts are tracked."""
 _PLAN = "plan.json"
 

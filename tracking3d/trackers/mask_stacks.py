@@ -1,8 +1,8 @@
-"""Masks in one file: a numpy array, an archive of arrays, or a video."""
+"""Masks in one file: numpy arrays, or a video."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import av
@@ -10,35 +10,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.runtime.array_files import ArrayFile, ArrayTooLargeError
+from tracking3d.trackers.array_planes import MappedPlanes, NamedPlanes, Planes, StackedPlanes, read_plane
 from tracking3d.trackers.mask_images import UnreadableMaskError, binarize, natural_key
 
 
 class ArrayMasks:
-    """Masks in an ``.npy`` or ``.npz`` file, never unpickled.
+    """Masks in an ``.npy`` or ``.npz`` file, never unpickled, each read when it is asked for.
 
     One array ``(N, H, W)`` of all masks, or in an ``.npz`` one array ``(H, W)`` under each frame's name.
 
     Raises:
-        InputError: If the file cannot be read or holds no such arrays.
+        InputError: If the file cannot be read, holds no such arrays, or a mask is larger than a frame can be.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.names: Sequence[str] = ()
         try:
-            loaded = np.load(path, mmap_mode="r", allow_pickle=False)
-            keys = [] if isinstance(loaded, np.ndarray) else sorted(loaded.files, key=natural_key)
-            first = loaded[keys[0]] if keys else loaded
-            self._arrays: Sequence[NDArray] | NDArray = first[None] if first.ndim == 2 else first
-            if len(keys) > 1 or (keys and first.ndim == 2):
-                self.names = [Path(key).stem for key in keys]
-                self._arrays = _Members(loaded, keys)
-            _plane(self._arrays[0])
+            self._arrays = self._open()
+            read_plane(self._arrays, 0)
+        except ArrayTooLargeError as error:
+            raise InputError(
+                f"{path} holds masks that are larger than a frame can be ({error}); give masks of the frames' size."
+            ) from error
         except Exception as error:  # zip, header, shape and dtype errors alike
             raise InputError(
                 f"{path} holds no masks; store an array (N, H, W) of numbers or booleans, or in an .npz one "
                 "array (H, W) under each frame's name."
             ) from error
+
+    def _open(self) -> Planes:
+        with self._path.open("rb") as file:
+            if file.read(4) != b"PK\x03\x04":
+                return MappedPlanes(self._path)
+        archive = ArrayFile(self._path)
+        names = sorted(archive.names, key=natural_key)
+        if len(names) == 1 and len(archive.header(names[0]).shape) > 2:
+            return StackedPlanes(archive, names[0])
+        self.names = [Path(name).stem for name in names]
+        return NamedPlanes(archive, names)
 
     def label(self, position: int) -> str:
         """The file's path and the array's name or number."""
@@ -49,29 +60,13 @@ class ArrayMasks:
         if position >= len(self._arrays):
             return None
         try:
-            return binarize(_plane(self._arrays[position]))
+            return binarize(read_plane(self._arrays, position))
+        except ArrayTooLargeError as error:
+            raise UnreadableMaskError(
+                f"{self.label(position)} is larger than a frame can be ({error})"
+            ) from error
         except Exception as error:  # a damaged member of the archive, or one of another shape
             raise UnreadableMaskError(f"{self.label(position)} cannot be read") from error
-
-
-class _Members(Sequence[NDArray]):
-    """The arrays of an open ``.npz`` file by position, each read when asked for."""
-
-    def __init__(self, archive: Mapping[str, NDArray], keys: list[str]) -> None:
-        self._archive, self._keys = archive, keys
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-    def __getitem__(self, position):  # type: ignore[no-untyped-def]
-        return self._archive[self._keys[position]]
-
-
-def _plane(array: NDArray) -> NDArray:
-    plane = np.squeeze(array, axis=tuple(a for a in (0, -1) if array.ndim == 3 and array.shape[a] == 1)[:1])
-    if plane.ndim != 2 or not plane.size or plane.dtype.kind not in "biuf":
-        raise ValueError(f"not a mask: shape {array.shape}, type {array.dtype}")
-    return plane
 
 
 class VideoMasks:

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.results import layout
+from tracking3d.runtime.array_files import ArrayFile
 
 _LARGEST_STATE = 2**26  # bytes of the state's text
+_LARGEST_ARRAY = 2**28
 _MOST = 200_000
 _ARRAY = re.compile(r"\d{8,}\.npz")
 
@@ -31,9 +33,15 @@ def landmarks_of_checkpoint(folder: Path) -> NDArray[np.float32] | None:
         name = session["solver"]["fields"]["known"]["fields"]["landmarks"]["file"]
         if not _ARRAY.fullmatch(name):
             return None
-        with np.load(state / name, allow_pickle=False) as arrays:
-            points = np.asarray(arrays["array"], np.float32)
-    except (OSError, ValueError, KeyError, TypeError):  # of another solver, none yet, or just being replaced
+        with ArrayFile(state / name) as arrays:
+            points = np.asarray(arrays.read("array", _LARGEST_ARRAY), np.float32)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RecursionError,
+    ):  # of another solver, none yet, or just being replaced
         return None
     if points.ndim != 2 or points.shape[1] != 3:
         return None

@@ -20,10 +20,15 @@ from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.readers.restricted_pickle import read_pickle
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
+from tracking3d.runtime.array_files import ArrayFile, ArrayTooLargeError
 from tracking3d.video.image_file import read_image
 
 RASTER = (256, 256)
 """Width and height of TAP-Vid's raster, assumed if a file does not state one."""
+
+
+_ARRAYS = ("tracks", "points", "occluded", "occlusion", "query_points")
+_POSITION = 16  # bytes of x and y
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +80,13 @@ def answers_from_tapvid(
     Raises:
         InputError: If the file cannot be read safely, lacks the clip, or its arrays do not fit it.
     """
-    arrays = _of_clip(_load(file), file, truth, name)
+    height, width = read_image(truth.frames[0]).shape[:2]
+    arrays = _of_clip(_load(file, height * width * len(truth.frames)), file, truth, name)
     tracks = _array(arrays, ("tracks", "points"), file, (None, len(truth.frames), 2))
     occluded = _array(arrays, ("occluded", "occlusion"), file, tracks.shape[:2]) > 0
     queries = None
     if "query_points" in arrays:
         queries = _array(arrays, ("query_points",), file, (len(tracks), 3))
-    height, width = read_image(truth.frames[0]).shape[:2]
     scale = np.array([width, height]) / _raster(arrays, tracks, raster, file)
     positions = (tracks * scale - 0.5).transpose(1, 0, 2)
     visible = ~occluded.T & np.isfinite(positions).all(2)
@@ -98,15 +103,25 @@ def answers_from_tapvid(
     )
 
 
-def _load(file: Path) -> Any:
+def _load(file: Path, most: int) -> Any:
+    """What the file holds; from an .npz, the arrays of tracks, of at most so many positions."""
     if file.suffix.lower() != ".npz":
         return read_pickle(file)
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-            return dict(arrays)
+        with ArrayFile(file) as arrays:
+            # The clip's own video is large, and only its size is needed.
+            sizes = [name for name in arrays.names if name == "video"]
+            return {
+                **{name: np.broadcast_to(np.uint8(0), arrays.header(name).shape) for name in sizes},
+                **{name: arrays.read(name, _POSITION * most) for name in _ARRAYS if name in arrays.names},
+            }
     except FileNotFoundError as error:
         raise InputError(f"There is no file {file}; check the path.") from error
-    except Exception as error:  # a damaged archive raises whatever its parts lead to
+    except ArrayTooLargeError as error:
+        raise InputError(
+            f"{file} has more tracks than a frame of this clip has pixels ({error}); see TAP-Vid's format."
+        ) from error
+    except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read as plain arrays ({error}); restore it.") from error
 
 

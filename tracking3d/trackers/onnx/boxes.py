@@ -109,7 +109,8 @@ def _read_output(file: Path) -> Any:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.dnn.readNetFromONNX(str(file))
+        # By its bytes: OpenCV ends the process if a path is not UTF-8.
+        return cv2.dnn.readNetFromONNX(np.frombuffer(file.read_bytes(), np.uint8))
     except cv2.error as error:
         raise InputError(
             f"{file} is not a network that OpenCV can run; give an ONNX file exported for OpenCV's tracker."
