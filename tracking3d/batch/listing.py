@@ -22,6 +22,7 @@ from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.pipeline.validation import needs_prompt
+from tracking3d.prompts.boxes import BoxFormat
 
 Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""
@@ -32,7 +33,9 @@ NO_PROMPT = (
 )
 
 
-def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJob]:
+def list_jobs(
+    place: str, configure: Configure, split: str = "", box_format: BoxFormat = "xywh"
+) -> list[VideoJob]:
     """The videos of a folder, a pattern or a table.
 
     Rows of one video with the same settings are one job with several objects. What is wrong with one video is its
@@ -42,6 +45,7 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
         place: What the user named.
         configure: Builds the pipeline of a row.
         split: Length of the parts that long videos are cut into, if a row does not give one; empty for none.
+        box_format: How boxes are written, if a row does not say so.
 
     Raises:
         InputError: If there is nothing, a table cannot be read, or two videos would have one name.
@@ -56,7 +60,11 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
         rows = [(_absolute(row, "."), size) for row, size in videos_of(place)]
     rows = _together(rows)
     names = _names([row for row, _ in rows], root)
-    return [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
+    jobs = [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
+    return [
+        replace(job, box_format=row.box_format or box_format)
+        for job, (row, _) in zip(jobs, rows, strict=True)
+    ]
 
 
 def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
@@ -70,6 +78,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     job = VideoJob(name, join_name(root, name), config, sequence=(layout, root, name))
     try:
         truth = read_sequence(load_layout(layout), dataset.root, name)
+        visible = truth.box_in_frame()
     except Tracking3dError as error:
         return replace(job, fault=str(error))
     if truth.box is None and needs_prompt(config):
@@ -78,7 +87,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
         settings = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
         config = config.model_copy(update={"camera": settings})
-    box = () if truth.box is None else (",".join(f"{value:.17g}" for value in truth.box),)
+    box = () if visible is None else (",".join(f"{value:.17g}" for value in visible),)
     size = sum(file.stat().st_size for file in truth.frames[:1]) * len(truth.frames)
     return replace(job, config=config, box=box, size=size)
 

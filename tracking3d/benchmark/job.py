@@ -188,7 +188,7 @@ def _record(job: Job, run: Path, listener: Listener) -> None:
     if job.variant.masks == "tracker":
         if truth.box is None:
             raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")
-        record(source, config, run, box=truth.box, overwrite=True, listener=listener)
+        record(source, config, run, box=truth.box_in_frame(), overwrite=True, listener=listener)
         return
     masks = masks_for(job.variant.masks, truth, job.folder / MASKS)
     tracker = {"name": "precomputed", "path": str(masks)}

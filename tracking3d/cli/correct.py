@@ -9,6 +9,7 @@ import typer
 
 from tracking3d.cli.options import Debug, Quiet, RunOrParent, Video
 from tracking3d.cli.options.output import Report
+from tracking3d.cli.options.prompt import BoxFormat
 
 
 def correct(
@@ -20,6 +21,7 @@ def correct(
             help="Prompt in a frame: X,Y,W,H, a mask file or 'X,Y+ X,Y-'. FRAME@OBJECT if there are several objects.",
         ),
     ],
+    box_format: BoxFormat = None,
     source: Video = None,
     report: Report = True,
     quiet: Quiet = False,
@@ -32,16 +34,20 @@ def correct(
     """
     import logging
 
+    from tracking3d.prompts.boxes import check_box_format
+    from tracking3d.prompts.corrections import parse_correction
+
+    written = check_box_format(box_format or "xywh")
+    parsed = [parse_correction(text, written) for text in corrections]
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import report_progress
     from tracking3d.pipeline.correct import correct_run, object_folders_of
-    from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    by_folder = object_folders_of(run, [parse_correction(text) for text in corrections])
+    by_folder = object_folders_of(run, parsed)
     for folder, theirs in by_folder.items():
         count = len(RunReader(folder).frames)
         with ExitStack() as ends:

@@ -10,22 +10,29 @@ from tracking3d.errors import InputError
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.frames import Box
+    from tracking3d.prompts.boxes import BoxFormat
 
 _ALL = "@all"
 
 
-def parse_given_box(text: str, frame: int) -> Box:
-    """Read ``X,Y,WIDTH,HEIGHT``, or the box of frame ``frame`` in a file in VOT's region format.
+def parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Box:
+    """Read a box, or the box of frame ``frame`` in a file in VOT's region format.
+
+    Args:
+        text: Four numbers, or the path of the file.
+        frame: Index of the frame.
+        box_format: What the four numbers are.
 
     Raises:
         InputError: The text is neither.
     """
-    from tracking3d.prompts.prompt import parse_box
-    from tracking3d.trackers.region_masks import box_in_file
+    from tracking3d.prompts.boxes import parse_box
 
     if Path(text).is_file():
+        from tracking3d.trackers.region_masks import box_in_file
+
         return box_in_file(Path(text), frame, f"--box {text}")
-    return parse_box(text)
+    return parse_box(text, box_format=box_format)
 
 
 def parse_given_masks(file: Path) -> list[Path]:

@@ -108,23 +108,27 @@ def _configure(
 
 def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
+    from tracking3d.prompts.boxes import check_box_format
     from tracking3d.prompts.points import parse_points
     from tracking3d.prompts.prompt import PromptSet
     from tracking3d.video.selection import parse_selection
 
     start = prompt.start_frame
     first = start if start is not None else parse_selection(frames).start
-    boxes = [parse_given_box(text, first) for text in prompt.box or ()]
+    box_format = check_box_format(prompt.box_format)
+    boxes = [parse_given_box(text, first, box_format) for text in prompt.box or ()]
     masks = [one for file in prompt.mask or () for one in parse_given_masks(file)]
     points = [parse_points(text) for text in prompt.points or ()]
     several = len(boxes) + len(masks) + len(points) > 1
-    return PromptSet(boxes, masks, points, start, as_lists=several)
+    return PromptSet(boxes, masks, points, start, as_lists=several, box_format=box_format)
 
 
 def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
+    from tracking3d.prompts.boxes import check_box_format
     from tracking3d.prompts.corrections import parse_correction, validate_corrections
 
-    corrections = [parse_correction(text) for text in prompt.correct or ()]
+    box_format = check_box_format(prompt.box_format)
+    corrections = [parse_correction(text, box_format) for text in prompt.correct or ()]
     validate_corrections(corrections, max(objects, 1))  # before anything is written
     return corrections
 

@@ -23,6 +23,8 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.results.files import read_mask
+from tracking3d.trackers.crops import clip_box
+from tracking3d.video.image_file import read_image
 
 
 class MaskReference(Protocol):
@@ -167,3 +169,13 @@ class Truth:
     def names(self) -> tuple[str, ...]:
         """The frames' names without suffix."""
         return tuple(path.stem for path in self.frames)
+
+    def box_in_frame(self) -> Box | None:
+        """The part of `box` inside frame 0, which is what a tracker starts from.
+
+        Data sets often give the box of the whole object, also if a part of it is beyond the edge of the frame.
+
+        Raises:
+            InputError: Frame 0 cannot be read.
+        """
+        return self.box and (clip_box(self.box, read_image(self.frames[0]).shape) or self.box)

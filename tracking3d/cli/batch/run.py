@@ -14,6 +14,7 @@ import typer
 
 from tracking3d.cli.evaluate.options import Address, Sequences
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
+from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
 
 if TYPE_CHECKING:
@@ -121,6 +122,7 @@ def run(
     *,
     data: Data = None,
     sequences: Sequences = None,
+    box_format: BoxFormat = None,
     settings: SettingsOptions,
     out: Out,
     overwrite: Overwrite = False,
@@ -143,9 +145,11 @@ def run(
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.cli.batch.progress import show_batch_progress
     from tracking3d.engines.choosing import open_engine
+    from tracking3d.prompts.boxes import check_box_format
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
+    written = check_box_format(box_format or "xywh")
     # Fail once for a wrong option, not once per video.
     config = settings.configure(runtime=_runtime(engine.threads))
     if split is not None:
@@ -153,7 +157,9 @@ def run(
     if data is not None:
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
-        videos = list_jobs(jobs, lambda row: _build_config(row, settings, engine.threads), split or "")
+        videos = list_jobs(
+            jobs, lambda row: _build_config(row, settings, engine.threads), split or "", written
+        )
     needs = _needs(videos, engine)
     with (
         open_engine(engine.address, engine.workers, needs) as workers,
