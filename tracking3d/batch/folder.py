@@ -110,7 +110,7 @@ def read_progress(out: str) -> BatchProgress:
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
         return BatchProgress(**document)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{join_path(out, PROGRESS)} is damaged ({error}); run the batch again.") from error
 
 

@@ -49,6 +49,9 @@ def read_table(place: str) -> list[VideoRow]:
 
 def _csv(content: bytes) -> list[tuple[int, dict[str, Any]]]:
     reader = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+    columns = reader.fieldnames or ()
+    if twice := next((name for name in columns if list(columns).count(name) > 1), None):
+        raise ValueError(f"it has two columns {twice}; remove one")
     rows = []
     for values in reader:
         more = values.pop(None, None)

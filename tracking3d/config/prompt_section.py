@@ -27,7 +27,8 @@ class PromptSection(Section):
         (), description="Box X,Y,W,H of the object in the first frame, or a list for several objects."
     )
     box_format: Literal["xywh", "xyxy"] | None = Field(
-        None, description="How boxes are written here: xywh (X,Y,WIDTH,HEIGHT, the default) or xyxy (X1,Y1,X2,Y2)."
+        None,
+        description="How boxes are written here: xywh (X,Y,WIDTH,HEIGHT, the default) or xyxy (X1,Y1,X2,Y2).",
     )
     mask: Texts = Field(
         (), description="Mask file of the object in the first frame, or a list for several objects."

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
 from typing import IO
+from urllib.parse import urlsplit
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.networks.catalogue import KnownNetwork
@@ -71,9 +72,14 @@ def fetch(
 
 
 def _in_mirror(network: KnownNetwork, mirror: str) -> str:
-    if not mirror.startswith(("http://", "https://")):
+    try:
+        address = urlsplit(mirror)
+        valid = address.scheme in ("http", "https") and bool(address.hostname) and address.port != 0
+    except ValueError:  # brackets that do not match, or a port that is no number
+        valid = False
+    if not valid:
         raise InputError(
-            f"The mirror {mirror} is not an address; give one that begins with http:// or https://."
+            f"The mirror {mirror} is not an address; give one such as https://example.org/networks."
         )
     if network.sha256 is None or network.size is None:
         raise InputError(

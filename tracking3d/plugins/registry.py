@@ -61,7 +61,9 @@ def list_plugins() -> list[PluginInfo]:
         else:
             try:
                 options = import_plugin(plugin).Options.model_json_schema()
-            except (Exception, SystemExit) as error:
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
                 status, reason = "broken", describe_exception(error)
         infos.append(
             PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
@@ -129,7 +131,9 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
         instance = _load(plugin).from_options(options)
     except Tracking3dError:
         raise
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise PluginError(f"{plugin.label} could not be started: {describe_exception(error)}.") from error
     if absent := [name for name in _ATTRIBUTES[group] if not hasattr(instance, name)]:
         raise PluginError(f"{plugin.label} is broken: it has no attribute {', '.join(absent)}.")
@@ -152,7 +156,9 @@ def _find(group: str, name: str) -> Registered:
 def _load(plugin: Registered) -> type[Any]:
     try:
         return import_plugin(plugin)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # some extensions raise what is not an `Exception`
         raise PluginError(
             f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists working plug-ins."
         ) from error

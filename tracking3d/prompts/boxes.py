@@ -145,9 +145,7 @@ def check_box_fits(
             advice = f"did you mean {_FORMS['xywh']} = {format_box(meant)}?"
         else:
             advice = f"give the part inside {label}, which is {pixels(size)} pixels."
-        raise InputError(
-            f"{name}{format_box(box, box_format)} reaches beyond the frame ({beyond}); {advice}"
-        )
+        raise InputError(f"{name}{format_box(box, box_format)} reaches beyond the frame ({beyond}); {advice}")
     return inside
 
 

@@ -110,9 +110,7 @@ class PromptSet:
             InputError: A prompt cannot be used in this frame, or the tracker reads the masks of one object only.
         """
         prompts: list[Prompt | None] = [
-            make_prompt(
-                frame, box, box_name=self._name(BOX, "boxes", number), box_format=self.box_format
-            )
+            make_prompt(frame, box, box_name=self._name(BOX, "boxes", number), box_format=self.box_format)
             for number, box in enumerate(self.boxes)
         ]
         prompts += [

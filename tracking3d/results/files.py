@@ -106,8 +106,11 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
 
 
 def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
-    """A mask from the bytes of such a file; None if they are no image."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    """A mask from the bytes of such a file; None if they are no image, or too large a one."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    except cv2.error:  # more pixels than OpenCV decodes
+        return None
     return None if image is None else image >= 128
 
 

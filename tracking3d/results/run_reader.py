@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, argument
+from tracking3d.frames import pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
 from tracking3d.results.camera_record import camera_from_record
@@ -171,13 +172,18 @@ class RunReader:
         """The estimated mask ``(H, W)`` of frame ``index``.
 
         Raises:
-            InputError: If there is none.
+            InputError: If there is none, or it is of another size than the frames.
         """
         path = self.mask_path(index)
         mask = read_mask(path)
         if mask is None:
             raise InputError(
                 f"The run {self.folder} has no mask of frame {index}; {path.name} is missing or damaged."
+            )
+        if mask.shape != (size := (self.camera.height, self.camera.width)):
+            raise InputError(
+                f"The mask {path} is {pixels(mask.shape)} pixels, but the frames of the run are {pixels(size)}; "
+                "restore it."
             )
         return mask
 

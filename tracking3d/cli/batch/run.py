@@ -16,6 +16,7 @@ from tracking3d.cli.evaluate.options import Address, Sequences
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
 from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.batch.rows import VideoRow
@@ -157,6 +158,10 @@ def run(
     if data is not None:
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
+        if sequences:
+            raise InputError(
+                "--sequence names sequences of a dataset; give its folder with --data, or leave it out."
+            )
         videos = list_jobs(
             jobs, lambda row: _build_config(row, settings, engine.threads), split or "", written
         )
@@ -195,7 +200,6 @@ def _check_split(
     split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
 ) -> None:
     from tracking3d.batch.storage import local
-    from tracking3d.errors import InputError
     from tracking3d.submaps.cuts import parse_length
     from tracking3d.submaps.job import refuse_what_cannot_be_joined
 
