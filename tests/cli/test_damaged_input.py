@@ -1,4 +1,4 @@
-"""Whatever a user gives that cannot be used ends with exit code 2 and one sentence, and is never taken without a word."""
+"""What cannot be used ends with exit code 2 and one sentence, and is never taken without a word."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_masks_of_another_size(call, run, command):
 
 
 def test_a_mask_of_more_pixels_than_can_be_decoded(refused, run, monkeypatch):
-    """OpenCV refuses to decode 40000 x 40000 pixels by raising an error; the file itself would take seconds to write."""
+    """OpenCV raises an error for 40000 x 40000 pixels; such a file would take seconds to write."""
 
     def refuse(*arguments):
         raise cv2.error("pixels <= CV_IO_MAX_IMAGE_PIXELS")

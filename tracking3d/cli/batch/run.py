@@ -14,8 +14,8 @@ import typer
 
 from tracking3d.cli.evaluate.options import Address, Sequences
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
-from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
