@@ -39,10 +39,13 @@ def correct(
 
     written = check_box_format(box_format or "xywh")
     parsed = [parse_correction(text, written) for text in corrections]
+    from tracking3d.results.layout import CORRECTING, RUN, check_run_folder, has_state, runs_in
+
+    for folder in runs_in(run):
+        check_run_folder(folder)
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import report_progress
     from tracking3d.pipeline.correct import correct_run, object_folders_of
-    from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
 
     if quiet:

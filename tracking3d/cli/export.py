@@ -13,7 +13,7 @@ from tracking3d.cli.options.panels import OUTPUT, VIDEO
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
-    from tracking3d.export.exporter import ExportOptions
+    from tracking3d.export.options import ExportOptions
 
 _CONTENT = "Content"
 
@@ -126,9 +126,10 @@ def export(
         return
     if run is None or to is None:
         raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
+    options = _exporter_options(content, video)
     from tracking3d.export.exporting import export_run
 
-    done = export_run(run, to, out, options=_exporter_options(content, video), overwrite=overwrite)
+    done = export_run(run, to, out, options=options, overwrite=overwrite)
     if done.not_finished:
         typer.echo(done.not_finished, err=True)
     if as_json:
@@ -141,7 +142,7 @@ def export(
 
 
 def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOptions:
-    from tracking3d.export.exporter import ExportOptions
+    from tracking3d.export.options import ExportOptions
 
     pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in content.xy or ())
     return ExportOptions(

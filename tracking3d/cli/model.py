@@ -38,6 +38,9 @@ def model(
 
     `tracking3d run` does this at its end; its option --model chooses how.
     """
+    from tracking3d.results.layout import check_run_folder
+
+    check_run_folder(run)
     from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
 
     if quality is ModelQuality.FINE:

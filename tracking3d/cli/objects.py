@@ -39,12 +39,14 @@ def parse_given_masks(file: Path) -> list[Path]:
     """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
 
     Raises:
-        InputError: The image shows no object.
+        InputError: The file does not exist, or the image shows no object.
     """
-    from tracking3d.trackers.mask_images import objects_in
+    from tracking3d.trackers.mask_images import objects_in, split_object
 
     name = str(file)
     if not name.endswith(_ALL) or file.exists():
+        if not split_object(file)[0].is_file():
+            raise InputError(f"--mask {file} does not exist.")
         return [file]
     image = Path(name.removesuffix(_ALL))
     if not image.is_file():

@@ -58,12 +58,16 @@ def pick(
     The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
     """
     from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
-    from tracking3d.pipeline.record import RecordOptions
-    from tracking3d.viewer.opening import check_viser
+    from tracking3d.video.addresses import check_source_name
 
-    if view:
-        check_viser("--view")
+    check_source_name(source)
     settings = configure(config, preset, overrides, tracker={"name": tracker})
+    if view:
+        from tracking3d.viewer.opening import check_viser
+
+        check_viser("--view")
+    from tracking3d.pipeline.record import RecordOptions
+
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, settings, folder, host, port, browser, overwrite)
     prompts = prompts_of(picked)

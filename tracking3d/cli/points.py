@@ -116,15 +116,18 @@ def points(
     the mesh does not cover are tracked in the images. A pixel outside the frame is an error, and so is one off the
     object without --any.
     """
-    from tracking3d.results.correspondences import grid_on_object, track_points
-    from tracking3d.results.run_reader import RunReader
+    from tracking3d.results.layout import check_run_folder
 
     pixels = query.pixels()
+    check_run_folder(run)
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
             raise OutputError(
                 f"{file} cannot be written: the folder {file.parent} does not exist; make it first."
             )
+    from tracking3d.results.correspondences import grid_on_object, track_points
+    from tracking3d.results.run_reader import RunReader
+
     reader = RunReader(run, refined=not query.causal)
     if query.grid is not None:
         pixels += grid_on_object(reader, query.frame, query.grid)

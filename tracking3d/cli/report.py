@@ -26,8 +26,11 @@ def report(
 
     If there are several objects, each gets its own report, and RUN/index.html links to them.
     """
+    from tracking3d.results.layout import check_run_folder, runs_in
+
+    for folder in runs_in(run):
+        check_run_folder(folder)
     from tracking3d.report.several import write_reports
-    from tracking3d.results.layout import runs_in
 
     for path in write_reports(runs_in(run)):
         typer.echo(path)

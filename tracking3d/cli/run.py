@@ -46,17 +46,19 @@ def run(
     Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
     run folder of its own.
     """
-    from tracking3d.pipeline.record import RecordOptions
+    # All that can be checked before what tracks is imported, which takes seconds.
     from tracking3d.pipeline.validation import needs_prompt
+    from tracking3d.video.addresses import check_source_name
 
     prompt = prompt.completed_from(settings.config)
     output.check()
     performance.check()
-    if output.model is ModelChoice.FINE:
-        check_fine(source)
-    config = _configure(prompt, camera, tracking, settings, output, performance)
+    check_source_name(source)
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
+    config = _configure(prompt, camera, tracking, settings, output, performance)
+    if output.model is ModelChoice.FINE:
+        check_fine(source)
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), output.model is ModelChoice.FINE, performance.split is not None)
     if not prompts and needs_prompt(config):
@@ -66,6 +68,8 @@ def run(
                 "--masks DIR, or draw it with `tracking3d pick`."
             )
         prompts = _ask_in_browser(source, config, folder, video.frames, output.overwrite)
+    from tracking3d.pipeline.record import RecordOptions
+
     options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
     request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
@@ -135,7 +139,7 @@ def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
 
 def _command() -> str:
     """The command line, for the record; without the passwords in it."""
-    from tracking3d.video.stream import without_password
+    from tracking3d.video.addresses import without_password
 
     return shlex.join(map(without_password, sys.argv))
 

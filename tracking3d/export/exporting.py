@@ -8,15 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exported_run import ARBITRARY, ExportedRun
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
-from tracking3d.results.files import writing
-from tracking3d.results.layout import OVERWRITE, partial_path, run_files
-from tracking3d.results.run_reader import RunReader
+from tracking3d.export.other_names import similar_formats
+from tracking3d.results.layout import OVERWRITE, check_run_folder, partial_path, run_files
+
+if TYPE_CHECKING:
+    from tracking3d.export.exported_run import ExportedRun
 
 FOLDER = "export"
 """Default folder of exports, in the run folder."""
@@ -61,6 +63,8 @@ class Export:
     @property
     def in_words(self) -> str:
         """The number of frames, unless only the model was exported, and the unit if it is arbitrary."""
+        from tracking3d.export.exported_run import ARBITRARY
+
         left_out = f", {len(self.without)} without an estimate" if self.without else ""
         unit = ", lengths in the arbitrary unit of the run" if self.unit == ARBITRARY else ""
         return f"the model{unit}" if self.of_model else f"{self.frames} frames{left_out}{unit}"
@@ -72,9 +76,12 @@ def find_format(name: str) -> Exporter:
     Raises:
         InputError: If there is none; names those that there are.
     """
-    if name not in FORMATS:
-        raise InputError(f"There is no format {name}; {_TO} takes {', '.join(FORMATS)}.")
-    return FORMATS[name]
+    if name in FORMATS:
+        return FORMATS[name]
+    known = f"{_TO} takes {', '.join(FORMATS)}"
+    if similar := similar_formats(name, FORMATS):
+        raise InputError(f"There is no format {name} ({known}); did you mean {' or '.join(similar)}?")
+    raise InputError(f"There is no format {name}; {known}.")
 
 
 def export_run(
@@ -103,6 +110,11 @@ def export_run(
     exporter.check_options(options, _NAMED)
     _check(options)
     exporter.check_available()
+    check_run_folder(Path(run))
+    # Only now, because they need seconds to import.
+    from tracking3d.export.exported_run import ExportedRun
+    from tracking3d.results.run_reader import RunReader
+
     reader = RunReader(Path(run), refined=options.answers == "final")
     exported = ExportedRun(reader, options)
     compact = exported.name.replace("-", "")
@@ -182,6 +194,8 @@ def _is_export(folder: Path) -> bool:
 @contextmanager
 def _replace_when_done(path: Path) -> Iterator[Path]:
     """A path of the same name in a folder next to ``path``; what is there at a good end replaces ``path``."""
+    from tracking3d.results.files import writing
+
     workshop = partial_path(path)
     made, earlier = workshop / path.name, workshop / "earlier"
     with writing(path):

@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.networks.catalogue import KnownNetwork
-from tracking3d.networks.session import Network
 from tracking3d.networks.store import VARIABLE, network_path, sha256_of
 from tracking3d.networks.transfer import Listener, TransferError, transfer
 
@@ -145,6 +144,8 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
             )
         if network.sha256 is None:
             try:
+                from tracking3d.networks.session import Network  # slow to import
+
                 Network(Path(part.name))
             except InputError as error:
                 raise InputError(

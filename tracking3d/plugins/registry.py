@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from tracking3d.config.explain import describe_validation_error, nearest, unknown_key
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import PluginError, Tracking3dError
+from tracking3d.plugins.other_names import advice_on_name
 from tracking3d.plugins.registration import (
     FEATURES,
     KIND,
@@ -147,7 +148,8 @@ def _find(group: str, name: str) -> Registered:
             return plugin
     installed = sorted({plugin.name for plugin in plugins})
     best = nearest(name, installed)
-    advice = f"; did you mean '{best}'?" if best else "."
+    advice = f"did you mean '{best}'?" if best else advice_on_name(group, name)
+    advice = f"; {advice}" if advice else "."
     raise PluginError(
         f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'}){advice}"
     )

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
 from tracking3d.frames import pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
@@ -42,8 +42,6 @@ _KINDS: dict[str, Any] = {
     "skipped": list,
     "notes": list,
 }
-
-_RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 
 
 class FormatError(InputError):
@@ -275,10 +273,8 @@ def _camera_fault(camera: Camera) -> str:
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
+    layout.check_run_folder(folder)
     path = folder / layout.RUN
-    if not path.is_file():
-        what = "holds no run.json" if folder.is_dir() else "does not exist"
-        raise InputError(f"{folder} is not a run folder: it {what}; give {_RUN}.")
     try:
         description = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:

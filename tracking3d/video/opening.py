@@ -10,13 +10,14 @@ from pathlib import Path
 
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Image
+from tracking3d.video.addresses import SCHEMES, check_source_name, scheme_of
 from tracking3d.video.array_source import ArraySource
 from tracking3d.video.image_file import is_still_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.live_camera import LiveCamera
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
-from tracking3d.video.stream import SCHEMES, open_stream, scheme_of
+from tracking3d.video.stream import open_stream
 from tracking3d.video.video_file import VideoFile
 
 _FPS = argument("fps=", "--fps")
@@ -67,10 +68,7 @@ def _validate_fps(fps: float | None) -> float | None:
 
 
 def _open_path(name: str, selection: range) -> FrameSource:
-    if not name.strip():
-        raise InputError(
-            "The source is empty; give a video file, a folder or pattern of images, or a camera number."
-        )
+    check_source_name(name)
     path = Path(name).expanduser()
     try:
         if path.is_dir():
@@ -81,19 +79,10 @@ def _open_path(name: str, selection: range) -> FrameSource:
         raise InputError(f"{name} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
     if name.isascii() and name.isdigit():
         return LiveCamera.open(int(name), selection)
-    if (scheme := scheme_of(name)) in SCHEMES:
+    if scheme_of(name) in SCHEMES:
         return open_stream(name, selection)
-    if scheme is not None and not glob.has_magic(name):
-        raise InputError(
-            f"{name} does not exist, and addresses with {scheme}: are not supported; give a path, or an "
-            f"address that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
-        )
-    if glob.has_magic(name):
-        found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
-        return ImageSequence.open(name, map(Path, found), selection)
-    raise InputError(
-        f"{name} does not exist; give a video file, a folder or pattern of images, or a camera number."
-    )
+    found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
+    return ImageSequence.open(name, map(Path, found), selection)
 
 
 def _open_file(name: str, path: Path, selection: range) -> VideoFile:

@@ -63,7 +63,9 @@ def read_answers(path: Path, truth: Truth, format: str | None = None, **options:
     """
     name = recognise_format(path) if format is None else format
     if name not in ANSWER_FORMATS:
-        raise InputError(f"There is no format '{name}'; choose one of {', '.join(ANSWER_FORMATS)}.")
+        raise InputError(
+            f"There is no format '{name}' (known are {', '.join(ANSWER_FORMATS)}); {hint(name, ANSWER_FORMATS)}"
+        )
     known = ANSWER_FORMATS[name]
     return known.read(path, truth, **_checked(options, path, known)), known.title
 
