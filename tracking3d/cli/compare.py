@@ -39,6 +39,10 @@ def compare(
     """Print what differs between runs on the same video: settings, masks, poses, statuses and time."""
     import json
 
+    from tracking3d.results.layout import check_run_folder
+
+    for folder in (*runs, *([] if against is None else [against])):
+        check_run_folder(folder)
     from tracking3d.report.differences import compare_runs
 
     comparison = compare_runs(runs, against)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
+    from tracking3d.cli.options.prompt import PromptOptions
     from tracking3d.config.models import PipelineConfig
     from tracking3d.frames import Box
     from tracking3d.prompts.boxes import BoxFormat
@@ -55,6 +56,29 @@ def parse_given_masks(file: Path) -> list[Path]:
     if not numbers:
         raise InputError(f"--mask {name} is empty; give each object a value from 1 upwards.")
     return [Path(f"{image}@{number}") for number in numbers]
+
+
+def check_files(prompt: PromptOptions, prototype: str | None) -> None:
+    """Make sure that what ``--masks``, ``--object`` and ``--prototype`` name exists, before anything reads it.
+
+    Raises:
+        InputError: One does not.
+    """
+    from tracking3d.trackers.mask_images import split_object
+
+    if prompt.masks is not None and not split_object(prompt.masks)[0].exists():
+        raise InputError(
+            f"--masks {prompt.masks} does not exist; give a folder, a video, an .npz or an .npy file, COCO's .json or "
+            "VOT's .txt."
+        )
+    if prompt.known is not None and not Path(prompt.known).expanduser().exists():
+        raise InputError(
+            f"--object {prompt.known} does not exist; give the folder of an earlier run, or a mesh file."
+        )
+    if prototype not in (None, "sphere", "ellipsoid") and not Path(str(prototype)).exists():
+        raise InputError(
+            f"The prototype '{prototype}' does not exist; give sphere, ellipsoid or a mesh file."
+        )
 
 
 def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import check_known, parse_given_box, parse_given_masks
+from tracking3d.cli.objects import check_files, check_known, parse_given_box, parse_given_masks
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.camera import CameraOptions
 from tracking3d.cli.options.output import ModelChoice, OutputOptions
@@ -49,11 +49,14 @@ def run(
     # All that can be checked before what tracks is imported, which takes seconds.
     from tracking3d.pipeline.validation import needs_prompt
     from tracking3d.video.addresses import check_source_name
+    from tracking3d.video.given_rates import validate_fps
 
     prompt = prompt.completed_from(settings.config)
     output.check()
     performance.check()
     check_source_name(source)
+    validate_fps(video.fps)
+    check_files(prompt, tracking.prototype)
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
     config = _configure(prompt, camera, tracking, settings, output, performance)

@@ -48,9 +48,10 @@ def view(
     The page follows a run that is still running. Several runs are shown side by side.
     """
     from tracking3d.viewer.opening import check_viser, open_viewer
-    from tracking3d.web.access import Access
 
     check_viser("`tracking3d view`")
+    from tracking3d.web.access import Access
+
     viewer = open_viewer(runs, Access.on(host), port, source)
     try:
         show_address(viewer.address, browser and host is None)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterable
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
 from tracking3d.frames import Image
 from tracking3d.video.addresses import SCHEMES, check_source_name, scheme_of
 from tracking3d.video.array_source import ArraySource
+from tracking3d.video.given_rates import FPS, validate_fps
 from tracking3d.video.image_file import is_still_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.live_camera import LiveCamera
@@ -19,10 +19,6 @@ from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
 from tracking3d.video.stream import open_stream
 from tracking3d.video.video_file import VideoFile
-
-_FPS = argument("fps=", "--fps")
-LEAST_FPS, MOST_FPS = 0.001, 100_000.0
-"""Images per second: from one in a quarter of an hour to the fastest cameras."""
 
 
 def open_source(
@@ -41,30 +37,19 @@ def open_source(
         InputError: If there is nothing that can be read as frames, the selection is bad or empty, or ``fps`` is given
             for a source that has times of its own.
     """
-    selection, fps = parse_selection(frames), _validate_fps(fps)
+    selection, fps = parse_selection(frames), validate_fps(fps)
     if isinstance(source, str | Path):
         opened = _open_path(str(source), selection)
         if fps is None:
             return opened
         if not isinstance(opened, ImageSequence):
-            raise InputError(f"{opened.name} has its own time stamps; {_FPS} is for images only.")
+            raise InputError(f"{opened.name} has its own time stamps; {FPS} is for images only.")
         return replace(opened, rate=fps)
     if isinstance(source, Iterable):
         return ArraySource(source, selection, rate=fps)
     raise InputError(
         f"A {type(source).__name__} is not a source of frames; give a path or an iterable of RGB arrays."
     )
-
-
-def _validate_fps(fps: float | None) -> float | None:
-    if fps is None:
-        return None
-    number = isinstance(fps, Real) and not isinstance(fps, bool)
-    if not number or not LEAST_FPS <= fps <= MOST_FPS:
-        raise InputError(
-            f"{_FPS} {fps!r:.40} is not a frame rate; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
-        )
-    return float(fps)
 
 
 def _open_path(name: str, selection: range) -> FrameSource:

@@ -58,6 +58,8 @@ def score_answers(
     import json
     from dataclasses import asdict
 
+    if not truth.is_dir():
+        raise InputError(f"There is no clip folder {truth}; give the folder which holds frames/ and masks/.")
     from tracking3d.cli.tables import print_table
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score

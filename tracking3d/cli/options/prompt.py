@@ -115,6 +115,8 @@ class PromptOptions:
         if sum(map(bool, (given.box, given.mask, given.points))) > 1:
             raise InputError("Give only one of --box, --mask and --points.")
         start_frame = in_file.start_frame if self.start_frame is None else self.start_frame
+        if start_frame is not None and start_frame < 0:
+            raise InputError(f"--start-frame {start_frame} is not a frame index; frames count from 0.")
         return replace(
             given,
             box_format=check_box_format(self.box_format or in_file.box_format or "xywh"),
