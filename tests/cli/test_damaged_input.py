@@ -206,6 +206,17 @@ def test_an_error_of_our_own_that_cannot_be_printed(call, monkeypatch, run):
 # What was taken without a word.
 
 
+@pytest.mark.usefixtures("script")
+@pytest.mark.parametrize(
+    "given", [("--masks", "regions.txt"), ("--box", "regions.txt")], ids=lambda given: given[0]
+)
+def test_rectangles_with_a_negative_side(refused, clip, given):
+    Path("regions.txt").write_text("20,10,20,20\n20,10,20,20\n40,30,-20,-20\n")
+    line = refused("run", clip, *given, "--out", "out", "--quiet")
+    assert "regions.txt, line 3: the rectangle 40,30,-20,-20 has a negative width or height; " in line
+    assert not Path("out").exists()
+
+
 def test_a_table_with_a_column_twice(refused):
     Path("videos.csv").write_text('video,box,box\na.mp4,"1,2,3,4","5,6,7,8"\n')
     assert "videos.csv cannot be read (it has two columns box; remove one)" in refused(

@@ -142,6 +142,8 @@ def test_the_mask_within_its_box():
         ("1,2", "2 numbers"),
         ("1,2,3,4,5", "5 numbers"),
         ("1,2,inf,4", "infinite"),
+        ("10,5,-3,4", "10,5,-3,4 has a negative width or height"),
+        ("10,5,3,-0.5", "10,5,3,-0.5 has a negative width or height"),
         ("m", "whole numbers"),
         ("m1,2,3", "runs"),
         ("m1,2,3,4.5,6", "whole numbers"),
