@@ -6,8 +6,10 @@ from collections.abc import Iterable
 
 from tracking3d.config.explain import nearest
 
-_FORMATS = {
+OTHER_NAMES = {
     "gltf": ("glb", "animated-glb"),
+    **dict.fromkeys(("usd", "usda", "usdc"), ("usdz",)),
+    **dict.fromkeys(("ros", "ros2", "rosbag", "bag", "db3"), ("ros-bag",)),
     "obj": ("glb", "nuke"),
     "fbx": ("animated-glb", "usdz"),
     "abc": ("animated-glb", "usdz"),
@@ -33,15 +35,15 @@ _FORMATS = {
     "poses": ("csv", "tum", "bop"),
     "points": ("points-csv", "tapvid"),
     "npz": ("tapvid",),
-    "ros2": ("ros-bag",),
     "mesh": ("glb", "ply", "stl"),
 }
+"""By name in small letters, without a dot before it."""
 
 
 def similar_formats(name: str, formats: Iterable[str]) -> list[str]:
     """The formats that are likely meant by ``name``, which is none of them; none if nothing comes close."""
     known = list(formats)
-    if meant := [one for one in _FORMATS.get(name.lower().lstrip("."), ()) if one in known]:
+    if meant := [one for one in OTHER_NAMES.get(name.lower().lstrip("."), ()) if one in known]:
         return meant
     best = nearest(name, known)
     return [] if best is None else [best]

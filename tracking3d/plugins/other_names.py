@@ -7,8 +7,8 @@ import re
 from tracking3d.plugins.registration import FEATURES, TRACKERS
 
 _SAM = (
-    "MobileSAM is the plug-in tracking3d-sam, or --tracker onnx with tracker.segmenter=mobile-sam, and masks of other "
-    "programs are read with --masks"
+    "MobileSAM is the plug-in tracking3d-sam (--tracker sam), or --tracker onnx with tracker.segmenter=mobile-sam, "
+    "and masks of other programs are read with --masks"
 )
 _MASKS = "masks of other programs are read with --masks"
 _U2NET = "that network runs in --tracker onnx with tracker.segmenter=u2netp"

@@ -147,12 +147,11 @@ def _find(group: str, name: str) -> Registered:
         if plugin.name == name:
             return plugin
     installed = sorted({plugin.name for plugin in plugins})
-    best = nearest(name, installed)
-    advice = f"did you mean '{best}'?" if best else advice_on_name(group, name)
-    advice = f"; {advice}" if advice else "."
-    raise PluginError(
-        f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'}){advice}"
-    )
+    advice = advice_on_name(group, name)
+    if not advice and (best := nearest(name, installed)):
+        advice = f"did you mean '{best}'?"
+    missing = f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'})"
+    raise PluginError(f"{missing}; {advice}" if advice else f"{missing}.")
 
 
 def _load(plugin: Registered) -> type[Any]:
