@@ -156,11 +156,7 @@ def run(
     # Fail once for a wrong option, not once per video.
     config = settings.configure(runtime=_runtime(engine.threads))
     from tracking3d.batch.listing import dataset_jobs, list_jobs
-    from tracking3d.batch.running import run_batch
-    from tracking3d.batch.storage import absolute
     from tracking3d.benchmark.sequences import open_dataset
-    from tracking3d.cli.batch.progress import show_batch_progress
-    from tracking3d.engines.choosing import open_engine
 
     if split is not None:
         _check_split(split, config, out, data, engine.address)
@@ -170,6 +166,11 @@ def run(
         videos = list_jobs(
             jobs, lambda row: _build_config(row, settings, engine.threads), split or "", written
         )
+    from tracking3d.batch.running import run_batch
+    from tracking3d.batch.storage import absolute
+    from tracking3d.cli.batch.progress import show_batch_progress
+    from tracking3d.engines.choosing import open_engine
+
     needs = _needs(videos, engine)
     with (
         open_engine(engine.address, engine.workers, needs) as workers,
