@@ -11,7 +11,19 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.machinery import ModuleSpec
 
-SLOW = ("torch", "torchvision", "kornia", "numba", "onnxruntime", "pyarrow", "ray", "viser", "rerun", "pxr")
+SLOW = (
+    "torch",
+    "torchvision",
+    "kornia",
+    "numba",
+    "onnxruntime",
+    "pyarrow",
+    "ray",
+    "viser",
+    "rerun",
+    "pxr",
+    "scipy.stats",
+)
 """What takes longer to import than the answer to a mistake may take."""
 
 
