@@ -37,7 +37,7 @@ def check_box_format(box_format: Any) -> BoxFormat:
             f"{name}{format_value(box_format)} is not a format of boxes; give xywh (X,Y,WIDTH,HEIGHT) or xyxy "
             "(X1,Y1,X2,Y2)."
         )
-    return box_format  # type: ignore[no-any-return] # it is one of the names
+    return box_format
 
 
 def parse_box(text: str, name: str = BOX, box_format: BoxFormat = "xywh") -> Box:
