@@ -317,7 +317,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
         ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--masks absent", "absent"),
-        ("--masks m --tracker csrt", "leave out --tracker csrt"),
+        ("--masks . --tracker csrt", "leave out --tracker csrt"),
         ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),
         ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
         ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),

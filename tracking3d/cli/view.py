@@ -50,11 +50,6 @@ def view(
     from tracking3d.viewer.opening import check_viser, open_viewer
 
     check_viser("`tracking3d view`")
-    from tracking3d.results.layout import check_run_folder, runs_in
-
-    for folder in runs:
-        for one in runs_in(folder):
-            check_run_folder(one)
     from tracking3d.web.access import Access
 
     viewer = open_viewer(runs, Access.on(host), port, source)

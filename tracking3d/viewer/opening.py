@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.results.layout import check_run_folder, runs_in
 
 if TYPE_CHECKING:
     from tracking3d.video.any_frame import FrameImages
@@ -53,6 +54,10 @@ def open_viewer(
         PluginError: If viser is not installed, or cannot be guarded.
     """
     check_viser("The viewer")
+    for folder in folders:
+        for run in runs_in(folder):
+            check_run_folder(run)
+    # Only now, because they need seconds to import.
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.opening import open_source
     from tracking3d.viewer.correcting import Corrections, RunCorrection
