@@ -91,7 +91,7 @@ def test_rectangles_cover_the_pixels_of_the_toolkit(text, columns, rows):
     assert len(x) == (columns[1] - columns[0] + 1) * (rows[1] - rows[0] + 1)
 
 
-@pytest.mark.parametrize("text", ["0,0,0,0", "5,5,0,4", "5,5,4,-1", "-9,-9,3,3", "-5.5,2,6,3"])
+@pytest.mark.parametrize("text", ["0,0,0,0", "5,5,0,4", "5,5,4,0", "-9,-9,3,3", "-5.5,2,6,3"])
 def test_rectangles_without_area_or_outside_are_empty(text):
     assert not drawn(text).any()
 

@@ -110,6 +110,8 @@ class SideBySide:
 
 def plan(base: Variant) -> Plan:
     """What is run: both solvers with RGB and deep features; `paper` as it is published, without what came later."""
+    from tracking3d.pipeline.track import SOLVERS  # slow to import
+
     variants: Plan = {}
     own = base.config.solver.model_dump()
     for solver in ("paper", NAME):
@@ -118,7 +120,9 @@ def plan(base: Variant) -> Plan:
             settings = {**settings, "final_refine": False, "tracker_feedback": False}
         for features in ("RGB", "S2DNet"):
             label = f"{solver}, {features}"
-            if features == "RGB":
+            if solver not in SOLVERS:
+                variants[label] = f"there is no solver {solver}"
+            elif features == "RGB":
                 variants[label] = base.with_changes(label, features={"name": "rgb"}, solver=settings)
             else:
                 variants[label] = deep(base, label, solver=settings)
