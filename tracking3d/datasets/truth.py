@@ -10,21 +10,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.gltf_axes import read_mesh_file
-from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.results.files import read_mask
 from tracking3d.trackers.crops import clip_box
 from tracking3d.video.image_file import read_image
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 class MaskReference(Protocol):
@@ -110,6 +110,9 @@ class MeshFile:
         Raises:
             InputError: If it is not a readable mesh.
         """
+        from tracking3d.geometry.gltf_axes import read_mesh_file  # slow to import
+        from tracking3d.geometry.mesh_checks import what_is_wrong
+
         try:
             mesh = read_mesh_file(self.path)
         except Exception as error:  # every format has errors of its own

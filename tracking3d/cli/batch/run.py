@@ -156,11 +156,12 @@ def run(
     # Fail once for a wrong option, not once per video.
     config = settings.configure(runtime=_runtime(engine.threads))
     from tracking3d.batch.listing import dataset_jobs, list_jobs
-    from tracking3d.benchmark.sequences import open_dataset
 
     if split is not None:
         _check_split(split, config, out, data, engine.address)
     if data is not None:
+        from tracking3d.benchmark.sequences import open_dataset
+
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
         videos = list_jobs(
