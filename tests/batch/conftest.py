@@ -10,7 +10,6 @@ import pytest
 from recorded_runs import estimate_of, frame_of, model, open_run
 from small_videos import BOX, write_video
 
-from tracking3d.batch import one_video
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.running import run_batch
 from tracking3d.config.loading import load_config
@@ -76,7 +75,7 @@ def finished_run(tmp_path_factory):
 @pytest.fixture
 def recorded(monkeypatch, finished_run):
     record = Recorded(finished_run)
-    monkeypatch.setattr(one_video, "record_tracking", record)
+    monkeypatch.setattr("tracking3d.pipeline.record.record_tracking", record)
     return record
 
 

@@ -25,6 +25,7 @@ from tracking3d.benchmark.solver_table import (
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
+from tracking3d.pipeline.track import SOLVERS
 
 BASE = Variant(label="default", config=load_config(), masks="truth")
 SUITE = Dataset("hard", 1, "clip", Path("nowhere"), ("a", "b", "c"))
@@ -47,7 +48,7 @@ ONLINE = ResultSet(
 
 @pytest.fixture
 def both(monkeypatch):
-    monkeypatch.setitem(solver_table.SOLVERS, "online", object)
+    monkeypatch.setitem(SOLVERS, "online", object)
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def test_the_columns_differ_by_solver_and_features_and_the_paper_has_nothing_tha
 
 
 def test_a_solver_that_is_not_there_is_said_to_be_missing(monkeypatch, tmp_path):
-    monkeypatch.delitem(solver_table.SOLVERS, "online", raising=False)
+    monkeypatch.delitem(SOLVERS, "online", raising=False)
     monkeypatch.setattr(solver_table, "run_suite", lambda variants, *rest: [PAPER] * len(variants))
     filled = fill(BASE, SUITE, tmp_path, ["*RGB"])
     assert filled.columns == ("paper, RGB",)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.benchmark import solver_table
 from tracking3d.benchmark import suite as suite_module
 from tracking3d.benchmark.pool import JobOutcome
 from tracking3d.benchmark.results import ResultSet, write_results
@@ -130,8 +129,7 @@ def test_a_table_is_printed_and_written_in_three_formats(call, clips, jobs, monk
     assert Path("keyframes.svg").read_text().startswith("<?xml")
 
 
-def test_the_solvers_are_put_side_by_side_with_causal_and_refined_answers(call, clips, jobs, monkeypatch):
-    monkeypatch.setitem(solver_table.SOLVERS, "online", object)
+def test_the_solvers_are_put_side_by_side_with_causal_and_refined_answers(call, clips, jobs):
     arguments = ("evaluate", "table", "online", "--data", clips, "--masks", "noise:3", "--row", "*RGB")
     result = call(*arguments, "--json")
     assert result.exit_code == 0, result.output

@@ -90,7 +90,7 @@ def test_pixels_are_followed(call, finished):
 def test_what_cannot_be_used_is_refused(call, refused, finished):
     assert "--list" in refused("export")
     assert "--list" in refused("export", finished)
-    assert "There is no format fbx; --to takes tum" in refused("export", finished, "--to", "fbx")
+    assert "There is no format fbx (--to takes tum" in refused("export", finished, "--to", "fbx")
     assert "absent is not a run folder" in refused("export", "absent", "--to", "tum")
     assert "does not use --cut-out" in refused("export", finished, "--to", "tum", "--cut-out")
     assert "--object-size is -1" in refused("export", finished, "--to", "tum", "--object-size", "-1")

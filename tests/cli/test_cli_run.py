@@ -62,7 +62,7 @@ def test_absent_flag_does_not_undo_the_files(call, clip, script, tmp_path):
 
 def test_quiet_prints_nothing_and_a_pipe_gets_no_bar(call, clip, script):
     assert call("run", clip, *BOX, "--quiet").output == ""
-    result = call("run", clip, "--box", "-5,10,20,20", "--quiet", "--out", "other")
+    result = call("run", clip, "--box", "-4,10,20,20", "--quiet", "--out", "other")
     assert (result.exit_code, result.output) == (0, "")
     assert "━" not in call("run", clip, *BOX, "--overwrite").stderr
 
@@ -165,8 +165,8 @@ def test_a_damaged_first_frame_is_skipped_where_that_is_asked_for(call, clip, sc
 
 
 def test_box_partly_outside_is_clipped_and_the_run_goes_on(call, clip, script, caplog):
-    assert call("run", clip, "--box", "-5,10,20,20").exit_code == 0
-    assert script.built[0][1].box == (0, 10, 15, 20)
+    assert call("run", clip, "--box", "-4,10,20,20").exit_code == 0
+    assert script.built[0][1].box == (0, 10, 16, 20)
     assert "extends beyond the frame" in caplog.text
 
 
@@ -344,7 +344,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
         ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--masks absent", "absent"),
-        ("--masks m --tracker csrt", "leave out --tracker csrt"),
+        ("--masks . --tracker csrt", "leave out --tracker csrt"),
         ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),
         ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
         ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),

@@ -103,7 +103,7 @@ REFUSED = {
     "--camera wide.yaml": "another aspect ratio",
     "--camera camera.yaml:left": "does not exist|has no camera left",
     "--mask first.png@3": "does not exist",
-    "--masks none.json": "none.json holds no masks",
+    "--masks none.json": "--masks none.json does not exist",
     "--masks camera.yaml": "cannot be read as masks",
 }
 

@@ -57,8 +57,8 @@ def test_box_inside_the_frame_is_kept(caplog):
 
 def test_box_partly_outside_is_clipped_with_a_note(caplog):
     with caplog.at_level(logging.WARNING):
-        assert make_prompt(FRAME, box=(-5, 40, 20, 30)).box == (0, 40, 15, 8)
-    assert "The box -5,40,20,30 extends beyond the frame" in caplog.text
+        assert make_prompt(FRAME, box=(-4, 40, 20, 12)).box == (0, 40, 16, 8)
+    assert "The box -4,40,20,12 extends beyond the frame" in caplog.text
 
 
 @pytest.mark.parametrize(

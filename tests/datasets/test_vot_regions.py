@@ -91,7 +91,7 @@ def test_rectangles_cover_the_pixels_of_the_toolkit(text, columns, rows):
     assert len(x) == (columns[1] - columns[0] + 1) * (rows[1] - rows[0] + 1)
 
 
-@pytest.mark.parametrize("text", ["0,0,0,0", "5,5,0,4", "5,5,4,-1", "-9,-9,3,3", "-5.5,2,6,3"])
+@pytest.mark.parametrize("text", ["0,0,0,0", "5,5,0,4", "5,5,4,0", "-9,-9,3,3", "-5.5,2,6,3"])
 def test_rectangles_without_area_or_outside_are_empty(text):
     assert not drawn(text).any()
 
@@ -142,6 +142,8 @@ def test_the_mask_within_its_box():
         ("1,2", "2 numbers"),
         ("1,2,3,4,5", "5 numbers"),
         ("1,2,inf,4", "infinite"),
+        ("10,5,-3,4", "10,5,-3,4 has a negative width or height"),
+        ("10,5,3,-0.5", "10,5,3,-0.5 has a negative width or height"),
         ("m", "whole numbers"),
         ("m1,2,3", "runs"),
         ("m1,2,3,4.5,6", "whole numbers"),

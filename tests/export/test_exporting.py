@@ -203,7 +203,7 @@ def test_extras_are_declared():
 @pytest.mark.parametrize(
     ("to", "options", "words"),
     [
-        ("gltf", {}, "There is no format gltf; to= takes tum, kitti"),
+        ("gltf", {}, "There is no format gltf (to= takes tum, kitti"),
         ("tum", {"cut_out": True}, "does not use cut_out="),
         ("vot", {"object_size": 1.0}, "does not use object_size="),
         ("tum", {"fps": 0.0}, "fps= is 0"),

@@ -16,6 +16,7 @@ from sample_videos import encode_video, moving_picture, shown_numbers
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video import open_source, stream
+from tracking3d.video.addresses import SCHEMES
 
 
 class Silent:
@@ -143,7 +144,7 @@ def test_a_server_that_says_nothing_is_given_up(scheme):
             open_source(f"{scheme}://127.0.0.1:{silent.getsockname()[1]}/x")
 
 
-@pytest.mark.parametrize("scheme", stream.SCHEMES)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_nobody_there_is_one_sentence_without_the_password(scheme):
     with socket.socket() as taken:  # bound, and not listening
         taken.bind(("127.0.0.1", 0))

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from tracking3d.batch.storage import join_path, read, write
-from tracking3d.batch.summary import COLUMNS
 from tracking3d.errors import InputError
 
 PROGRESS, RESULTS, PARQUET, FAILURES = "progress.json", "results.csv", "results.parquet", "failures.csv"
@@ -110,7 +109,7 @@ def read_progress(out: str) -> BatchProgress:
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
         return BatchProgress(**document)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{join_path(out, PROGRESS)} is damaged ({error}); run the batch again.") from error
 
 
@@ -120,6 +119,8 @@ def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable
     Raises:
         OutputError: If one cannot be written; it is then as it was.
     """
+    from tracking3d.batch.summary import COLUMNS
+
     write(join_path(out, RESULTS), _csv(COLUMNS, rows))
     write(join_path(out, FAILURES), _csv(_FAILURE, [asdict(one) for one in failures]))
     if (content := _parquet(rows)) is not None:
@@ -169,6 +170,8 @@ def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
         from pyarrow import parquet
     except ImportError:
         return None
+    from tracking3d.batch.summary import COLUMNS
+
     types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
     schema = pyarrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
     table = pyarrow.Table.from_pylist([{name: row.get(name) for name in COLUMNS} for row in rows], schema)

@@ -24,6 +24,7 @@ from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.pipeline.validation import needs_prompt
+from tracking3d.prompts.boxes import BoxFormat
 
 Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""
@@ -34,7 +35,9 @@ NO_PROMPT = (
 )
 
 
-def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJob]:
+def list_jobs(
+    place: str, configure: Configure, split: str = "", box_format: BoxFormat = "xywh"
+) -> list[VideoJob]:
     """The videos of a folder, a pattern or a table.
 
     Rows of one video with the same settings are one job with several objects. What is wrong with one video is its
@@ -44,6 +47,7 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
         place: What the user named.
         configure: Builds the pipeline of a row.
         split: Length of the parts that long videos are cut into, if a row does not give one; empty for none.
+        box_format: How boxes are written, if a row does not say so.
 
     Raises:
         InputError: If there is nothing, no row of a table can be used, or two videos would have one name.
@@ -63,6 +67,10 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
     rows = _together(rows)
     names = _names([row for row, _ in rows], root)
     jobs = [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
+    jobs = [
+        replace(job, box_format=row.box_format or box_format)
+        for job, (row, _) in zip(jobs, rows, strict=True)
+    ]
     return jobs + [_job_of_unusable(row, names) for row in unusable]
 
 
@@ -77,6 +85,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     job = VideoJob(name, join_name(root, name), config, sequence=(layout, root, name))
     try:
         truth = read_sequence(load_layout(layout), dataset.root, name)
+        visible = truth.box_in_frame()
     except Tracking3dError as error:
         return replace(job, fault=str(error))
     if truth.box is None and needs_prompt(config):
@@ -85,7 +94,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
         settings = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
         config = config.model_copy(update={"camera": settings})
-    box = () if truth.box is None else (",".join(f"{value:.17g}" for value in truth.box),)
+    box = () if visible is None else (",".join(f"{value:.17g}" for value in visible),)
     size = sum(file.stat().st_size for file in truth.frames[:1]) * len(truth.frames)
     return replace(job, config=config, box=box, size=size)
 

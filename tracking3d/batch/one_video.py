@@ -23,12 +23,10 @@ from tracking3d.datasets.reading import read_sequence
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.pipeline.open_tracking import request_tracking
-from tracking3d.pipeline.record import RecordOptions, record_tracking
+from tracking3d.prompts.boxes import parse_box
 from tracking3d.prompts.corrections import parse_correction
 from tracking3d.prompts.points import parse_points
-from tracking3d.prompts.prompt import PromptSet, parse_box
-from tracking3d.report.several import write_reports
+from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import FrameRecord
@@ -142,6 +140,8 @@ def put_away(
         OutputError: If something cannot be written.
     """
     if report:
+        from tracking3d.report.several import write_reports
+
         write_reports(runs)
     marker = write_marker(work / RUN, job, attempts, runs, note)
     _put_into_place(work / RUN, join_path(out, job.name))
@@ -151,15 +151,19 @@ def put_away(
 
 
 def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
+    # Not before: the process that hands out the videos need not wait for what tracks.
+    from tracking3d.pipeline.open_tracking import request_tracking
+    from tracking3d.pipeline.record import RecordOptions, record_tracking
+
     source = _source(job)
     passes = 2 if job.config.solver.final_refine else 1
     whole = source.count and source.count * job.objects * passes
     listener = counting(tell, whole)
-    boxes: list[Any] = [parse_box(text) for text in job.box]
+    boxes: list[Any] = [parse_box(text, box_format=job.box_format) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
-    prompts = PromptSet(boxes, masks, points, job.start_frame, as_lists=job.objects > 1)
-    corrections = [parse_correction(text) for text in job.correct]
+    prompts = PromptSet(boxes, masks, points, job.start_frame, job.objects > 1, job.box_format)
+    corrections = [parse_correction(text, job.box_format) for text in job.correct]
     request = request_tracking(source, job.config, prompts, corrections)
     record_tracking(request, run, RecordOptions(command, job.frames, resume=True), listener)
 

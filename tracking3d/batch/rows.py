@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, ValidationError
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.section import Section
 from tracking3d.errors import InputError
+from tracking3d.prompts.boxes import BoxFormat
 
 SEPARATOR = ";"
 """Between several values in one cell."""
@@ -59,6 +60,7 @@ class VideoRow(Section):
     video: str
     name: str | None = None
     box: Texts = ()
+    box_format: BoxFormat | None = None
     mask: Texts = ()
     points: Texts = ()
     correct: Texts = ()

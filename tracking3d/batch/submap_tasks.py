@@ -17,8 +17,9 @@ from tracking3d.batch.one_video import (
 )
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.protocol import Tell
+from tracking3d.prompts.boxes import parse_box
 from tracking3d.prompts.points import parse_points
-from tracking3d.prompts.prompt import PromptSet, parse_box
+from tracking3d.prompts.prompt import PromptSet
 from tracking3d.submaps.job import LongVideo, SplitResult
 from tracking3d.submaps.plan_step import Begun, begin
 from tracking3d.submaps.steps import Step
@@ -103,10 +104,11 @@ def settle_in_parts(
 
 
 def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
-    prompts = PromptSet.of_one(
-        next(map(parse_box, job.box), None),
-        next(map(Path, job.mask), None),
-        next(map(parse_points, job.points), None),
+    prompts = PromptSet(
+        [parse_box(text, box_format=job.box_format) for text in job.box],
+        [Path(file) for file in job.mask],
+        [parse_points(text) for text in job.points],
+        box_format=job.box_format,
     )
     return LongVideo(
         job.video,

@@ -8,19 +8,19 @@ import platform
 import posixpath
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from tracking3d.batch.video_job import VideoJob
-from tracking3d.report.frame_pictures import jpeg_of
 from tracking3d.results import layout
 from tracking3d.results.description import now, time_per_frame
 from tracking3d.results.files import write_atomic
 from tracking3d.results.overlay import OverlaySize
-from tracking3d.results.redrawing import overlay_frames
-from tracking3d.results.run_reader import RunReader
+
+if TYPE_CHECKING:
+    from tracking3d.results.run_reader import RunReader
 
 MARKER = "batch.json"
 """Name of a file in every complete run folder of a batch; on remote storage it is written last."""
@@ -86,6 +86,9 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
 
 def thumbnail(run: RunReader) -> str:
     """The overlay of the frame in the middle, as a small JPEG in base64; empty if there is none."""
+    from tracking3d.report.frame_pictures import jpeg_of
+    from tracking3d.results.redrawing import overlay_frames
+
     rows = OverlaySize.of(run.camera).picture
     for image in overlay_frames(run, [len(run.frames) // 2]):
         picture = image[:rows]
@@ -110,6 +113,8 @@ def write_marker(
     Raises:
         OutputError: If it cannot be written.
     """
+    from tracking3d.results.run_reader import RunReader  # slow to import
+
     runs = runs or layout.runs_in(folder)
     readers = [RunReader(one) for one in runs]
     names = [posixpath.join(job.name, one.relative_to(folder).as_posix()).removesuffix("/.") for one in runs]

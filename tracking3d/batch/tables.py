@@ -96,6 +96,9 @@ def _csv(content: bytes) -> Iterator[tuple[int, Any]]:
     # What is not UTF-8 becomes a lone surrogate, which is found in the row where it is.
     text = content.decode("utf-8-sig", "surrogateescape")
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    columns = reader.fieldnames or ()
+    if twice := next((name for name in columns if list(columns).count(name) > 1), None):
+        raise ValueError(f"it has two columns {twice}; remove one")
     for values in reader:
         if values.pop(None, None):
             yield reader.line_num, ValueError("it has more values than there are columns")

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from tracking3d.config.models import PipelineConfig
+from tracking3d.prompts.boxes import BoxFormat
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class VideoJob:
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
         size: Bytes of the video, if known: large ones are begun first.
         fault: Why it cannot be done, if known beforehand.
+        box_format: How boxes are written, in corrections too.
         split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
     """
 
@@ -44,6 +46,7 @@ class VideoJob:
     size: int = 0
     fault: str = ""
     split: str = ""
+    box_format: BoxFormat = "xywh"
 
     @property
     def in_parts(self) -> bool:
@@ -70,4 +73,6 @@ class VideoJob:
         }
         if self.split:
             identity["split"] = self.split
+        if self.box_format != "xywh":
+            identity["box_format"] = self.box_format
         return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]

@@ -7,7 +7,6 @@ look at the jackknife", 1979).
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import bootstrap
 
 LEVEL = 0.95
 RESAMPLES = 9999
@@ -22,6 +21,8 @@ def interval(values: np.ndarray, seed: int = 0) -> tuple[float | None, float | N
         return None, None
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
+    from scipy.stats import bootstrap  # slow to import
+
     result = bootstrap(
         (values,),
         np.mean,

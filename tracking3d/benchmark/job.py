@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tracking3d.benchmark.fingerprint import (
     code_fingerprint,
@@ -31,11 +31,13 @@ from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.evaluation.score import score
-from tracking3d.pipeline.record import Listener, record
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.runtime.memory import resident_memory
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
+
+if TYPE_CHECKING:
+    from tracking3d.pipeline.record import Listener
 
 JOB, SCORES, RUN, LOG, MASKS = "job.json", "scores.json", "run", "log.txt", "initial_masks"
 MEMORY = "memory.json"
@@ -186,6 +188,8 @@ def _track(job: Job, run: Path) -> None:
 
 
 def _record(job: Job, run: Path, listener: Listener) -> None:
+    from tracking3d.pipeline.record import record  # slow to import
+
     truth, config = job.truth, job.config
     source: FrameSource = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
     if job.variant.input.grey_noise is not None:
@@ -193,7 +197,7 @@ def _record(job: Job, run: Path, listener: Listener) -> None:
     if job.variant.masks == "tracker":
         if truth.box is None:
             raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")
-        record(source, config, run, box=truth.box, overwrite=True, listener=listener)
+        record(source, config, run, box=truth.box_in_frame(), overwrite=True, listener=listener)
         return
     masks = masks_for(job.variant.masks, truth, job.folder / MASKS)
     tracker = {"name": "precomputed", "path": str(masks)}

@@ -72,7 +72,8 @@ def play_live(config: PipelineConfig, truth: Truth, seconds: float = 20.0, rate:
         raise InputError(
             f"A clip cannot be played for {seconds} s at {rate} frames a second; give more than 0."
         )
-    if truth.box is None:
+    box = truth.box_in_frame()
+    if box is None:
         raise InputError(f"{truth.name} has no box in its first frame; a mask tracker cannot start.")
     images = [read_image(path) for path in truth.frames]
     last = max(round(seconds * rate), 2)
@@ -82,7 +83,7 @@ def play_live(config: PipelineConfig, truth: Truth, seconds: float = 20.0, rate:
     for item in newest(_to_and_fro(images, last), rate):
         if isinstance(item, SkippedFrame):
             continue
-        session = session or _session(config, item, truth.box)
+        session = session or _session(config, item, box)
         stages.append(session.step(item).stages or StageTimes())
         ends.append(time.monotonic() - started)
         lags.append(ends[-1] - (item.time or 0.0))

@@ -228,7 +228,7 @@ def _prompt(truth: Truth, frame: Frame, start: Start) -> Prompt:
         return make_prompt(frame, mask=truth.masks[0].read())
     if truth.box is None:
         raise InputError(f"{truth.name} has no box in its first frame; a mask tracker cannot start.")
-    return make_prompt(frame, box=truth.box)
+    return make_prompt(frame, box=truth.box_in_frame())
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,6 @@ from tracking3d.benchmark.table import file_name
 from tracking3d.benchmark.tables import Plan, deep
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
-from tracking3d.pipeline.track import SOLVERS
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.runtime.stage_times import STAGES
 
@@ -111,6 +110,8 @@ class SideBySide:
 
 def plan(base: Variant) -> Plan:
     """What is run: both solvers with RGB and deep features; `paper` as it is published, without what came later."""
+    from tracking3d.pipeline.track import SOLVERS  # slow to import
+
     variants: Plan = {}
     own = base.config.solver.model_dump()
     for solver in ("paper", NAME):

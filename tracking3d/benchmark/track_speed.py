@@ -112,7 +112,7 @@ def measure(
 
 
 def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -> TrackSpeed:
-    box = ",".join(f"{side:g}" for side in truth.box or ())
+    box = ",".join(f"{side:g}" for side in truth.box_in_frame() or ())
     some = ["--frames", f":{frames}"] if frames else []
     command = [
         "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--overwrite", "--no-report", "--quiet",

@@ -40,6 +40,10 @@ def compare(
     """Print what differs between runs on the same video: settings, masks, poses, statuses and time."""
     import json
 
+    from tracking3d.results.layout import check_run_folder
+
+    for folder in (*runs, *([] if against is None else [against])):
+        check_run_folder(folder)
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.report.comparison", quiet)

@@ -9,6 +9,7 @@ import typer
 
 from tracking3d.cli.options import Debug, Quiet, RunOrParent, Video
 from tracking3d.cli.options.output import Report
+from tracking3d.cli.options.prompt import BoxFormat
 
 
 def correct(
@@ -20,6 +21,7 @@ def correct(
             help="Prompt in a frame: X,Y,W,H, a mask file or 'X,Y+ X,Y-'. FRAME@OBJECT if there are several objects.",
         ),
     ],
+    box_format: BoxFormat = None,
     source: Video = None,
     report: Report = True,
     quiet: Quiet = False,
@@ -32,6 +34,15 @@ def correct(
     """
     import logging
 
+    from tracking3d.prompts.boxes import check_box_format
+    from tracking3d.prompts.corrections import parse_correction
+
+    written = check_box_format(box_format or "xywh")
+    parsed = [parse_correction(text, written) for text in corrections]
+    from tracking3d.results.layout import CORRECTING, RUN, check_run_folder, has_state, runs_in
+
+    for folder in runs_in(run):
+        check_run_folder(folder)
     from tracking3d.cli.plans import plan_run
     from tracking3d.cli.progress import load_with_progress, show_progress
     from tracking3d.cli.report import report_at_end
@@ -44,13 +55,11 @@ def correct(
         object_folders_of,
         replaced_by_correction,
     )
-    from tracking3d.prompts.corrections import parse_correction
-    from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    by_folder = object_folders_of(run, [parse_correction(text) for text in corrections])
+    by_folder = object_folders_of(run, parsed)
     for folder, theirs in by_folder.items():
         check_corrections(folder, theirs)
         for sentence in replaced_by_correction(folder, report) if not quiet else ():

@@ -14,8 +14,8 @@ from tracking3d.cli.options.panels import OUTPUT, VIDEO
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
-    from tracking3d.export.exporter import ExportOptions
     from tracking3d.export.exporting import Export
+    from tracking3d.export.options import ExportOptions
 
 _CONTENT = "Content"
 
@@ -138,9 +138,7 @@ def export(
         return
     if run is None or to is None:
         raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
-    from tracking3d.cli.progress import load_with_progress, show_progress
-
-    load_with_progress("tracking3d.export.exporting", quiet)
+    from tracking3d.cli.progress import show_progress
     from tracking3d.export.exporting import export_run
     from tracking3d.results.layout import runs_in
 
@@ -169,7 +167,7 @@ def _print_export(done: Export, as_json: bool, quiet: bool) -> None:
 
 
 def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOptions:
-    from tracking3d.export.exporter import ExportOptions
+    from tracking3d.export.options import ExportOptions
 
     pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in content.xy or ())
     return ExportOptions(

@@ -43,6 +43,9 @@ def model(
     `tracking3d run` does this at its end, with the same option --model. The run's contact sheet, report and turntable
     are made again, if it has them.
     """
+    from tracking3d.results.layout import check_run_folder
+
+    check_run_folder(run)
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)

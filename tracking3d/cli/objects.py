@@ -8,36 +8,46 @@ from typing import TYPE_CHECKING
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
+    from tracking3d.cli.options.prompt import PromptOptions
     from tracking3d.config.models import PipelineConfig
     from tracking3d.frames import Box
+    from tracking3d.prompts.boxes import BoxFormat
 
 _ALL = "@all"
 
 
-def parse_given_box(text: str, frame: int) -> Box:
-    """Read ``X,Y,WIDTH,HEIGHT``, or the box of frame ``frame`` in a file in VOT's region format.
+def parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Box:
+    """Read a box, or the box of frame ``frame`` in a file in VOT's region format.
+
+    Args:
+        text: Four numbers, or the path of the file.
+        frame: Index of the frame.
+        box_format: What the four numbers are.
 
     Raises:
         InputError: The text is neither.
     """
-    from tracking3d.prompts.prompt import parse_box
-    from tracking3d.trackers.region_masks import box_in_file
+    from tracking3d.prompts.boxes import parse_box
 
     if Path(text).is_file():
+        from tracking3d.trackers.region_masks import box_in_file
+
         return box_in_file(Path(text), frame, f"--box {text}")
-    return parse_box(text)
+    return parse_box(text, box_format=box_format)
 
 
 def parse_given_masks(file: Path) -> list[Path]:
     """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
 
     Raises:
-        InputError: The image shows no object.
+        InputError: The file does not exist, or the image shows no object.
     """
-    from tracking3d.trackers.mask_images import objects_in
+    from tracking3d.trackers.mask_images import objects_in, split_object
 
     name = str(file)
     if not name.endswith(_ALL) or file.exists():
+        if not split_object(file)[0].is_file():
+            raise InputError(f"--mask {file} does not exist.")
         return [file]
     image = Path(name.removesuffix(_ALL))
     if not image.is_file():
@@ -46,6 +56,29 @@ def parse_given_masks(file: Path) -> list[Path]:
     if not numbers:
         raise InputError(f"--mask {name} is empty; give each object a value from 1 upwards.")
     return [Path(f"{image}@{number}") for number in numbers]
+
+
+def check_files(prompt: PromptOptions, prototype: str | None) -> None:
+    """Make sure that what ``--masks``, ``--object`` and ``--prototype`` name exists, before anything reads it.
+
+    Raises:
+        InputError: One does not.
+    """
+    from tracking3d.trackers.mask_images import split_object
+
+    if prompt.masks is not None and not split_object(prompt.masks)[0].exists():
+        raise InputError(
+            f"--masks {prompt.masks} does not exist; give a folder, a video, an .npz or an .npy file, COCO's .json or "
+            "VOT's .txt."
+        )
+    if prompt.known is not None and not Path(prompt.known).expanduser().exists():
+        raise InputError(
+            f"--object {prompt.known} does not exist; give the folder of an earlier run, or a mesh file."
+        )
+    if prototype not in (None, "sphere", "ellipsoid") and not Path(str(prototype)).exists():
+        raise InputError(
+            f"The prototype '{prototype}' does not exist; give sphere, ellipsoid or a mesh file."
+        )
 
 
 def check_known(settings: PipelineConfig, objects: int, split: bool) -> None:

@@ -65,18 +65,22 @@ def pick(
     The page shows at once the mask that the tracker makes from it. Tracker, quality, final mesh, features and lens can
     be changed there. It also offers the command and a YAML file to copy.
     """
-    from tracking3d.cli.progress import load_with_progress
-
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    from tracking3d.cli.progress import load_with_progress, show_progress
     from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
-    from tracking3d.pipeline.record import RecordOptions
-    from tracking3d.viewer.opening import check_viser
+    from tracking3d.video.addresses import check_source_name
 
-    if view:
-        check_viser("--view")
+    check_source_name(source)
     tracking = TrackingOptions(tracker, features)
     menu = settings_menu(source, frames, tracking, camera, settings, _configure)
-    config = menu.configure(menu.chosen)
+    with show_progress(quiet):  # plug-ins are imported to check their options
+        config = menu.configure(menu.chosen)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    if view:
+        from tracking3d.viewer.opening import check_viser
+
+        check_viser("--view")
+    from tracking3d.pipeline.record import RecordOptions
+
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite, menu)
     prompts = prompts_of(picked)

@@ -118,7 +118,10 @@ def points(
     the mesh does not cover are tracked in the images. A pixel outside the frame is an error, and so is one off the
     object without --any.
     """
+    from tracking3d.results.layout import check_run_folder
+
     pixels = query.pixels()
+    check_run_folder(run)
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
             raise OutputError(

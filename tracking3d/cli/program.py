@@ -102,8 +102,14 @@ def _report(error: Exception) -> int:
         sentence, code = _usage(error), 2
     elif too_little := _too_little(error):
         sentence, code = too_little, 2
+    elif isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        name = os.fsdecode(error.filename or "A name")
+        sentence, code = (
+            f"{name[:60]}... is too long for the name of a file or folder; choose a shorter one.",
+            2,
+        )
     else:
-        what = f"{type(error).__name__}: {error}"
+        what = f"{type(error).__name__}: {_text(error)}"
         sentence, code = f"this is a bug in tracking3d ({what}); add --debug to see where.", 1
     if sentence:
         _print(f"error: {' '.join(sentence.split())}", error)
@@ -115,7 +121,7 @@ def _too_little(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         _print_nowhere()
         return f"the output cannot be written ({error.strerror}); free some disk space, or redirect it elsewhere."
-    if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+    if isinstance(error, MemoryError) or _NO_MEMORY.search(_text(error)):
         return (
             "there is not enough memory; lower --size (window.size), object.texture_size or solver.max_keyframes, "
             "track fewer objects at once, or close other programs."
@@ -129,6 +135,14 @@ _NO_MEMORY = re.compile(
     re.IGNORECASE,
 )
 """How torch, OpenCV, LLVM and the system report missing memory; not all of them raise a `MemoryError`."""
+
+
+def _text(error: BaseException) -> str:
+    """What an exception says; it may come from code that cannot even say that."""
+    try:
+        return str(error)
+    except Exception:
+        return "it cannot be printed"
 
 
 def _is_unread(error: BaseException | None) -> bool:

@@ -27,12 +27,15 @@ def report(
 
     If there are several objects, each gets its own report, and RUN/index.html links to them.
     """
+    from tracking3d.results.layout import check_run_folder, runs_in
+
+    for folder in runs_in(run):
+        check_run_folder(folder)
     from tracking3d.cli.plans import plan_report
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.report.several", quiet, kernels=True)
     from tracking3d.report.several import write_reports
-    from tracking3d.results.layout import runs_in
     from tracking3d.results.run_reader import RunReader
 
     folders = runs_in(run)

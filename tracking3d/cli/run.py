@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from tracking3d.cli.model import check_model_source
-from tracking3d.cli.objects import check_known, parse_given_box, parse_given_masks
+from tracking3d.cli.objects import check_files, check_known, parse_given_box, parse_given_masks
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.camera import CameraOptions
 from tracking3d.cli.options.output import OutputOptions
@@ -49,21 +49,26 @@ def run(
     Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
     run folder of its own.
     """
-    from tracking3d.cli.progress import load_with_progress
-
-    output.check()
-    performance.check()
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
-    from tracking3d.pipeline.record import RecordOptions
+    # All that can be checked before what tracks is imported, which takes seconds.
+    from tracking3d.cli.progress import load_with_progress, show_progress
     from tracking3d.pipeline.validation import needs_prompt
+    from tracking3d.video.addresses import check_source_name
+    from tracking3d.video.given_rates import validate_fps
 
     prompt = prompt.completed_from(settings.config)
-    check_model_source(settings.model, source)
+    output.check()
+    performance.check()
+    check_source_name(source)
+    validate_fps(video.fps)
+    check_files(prompt, tracking.prototype)
     if prompt.known is not None and output.object_size is not None:
         raise InputError("A known object has its own unit; leave out --object-size, or --object.")
-    config = _configure(prompt, camera, tracking, settings, output, performance)
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
+    with show_progress(quiet):  # plug-ins are imported to check their options
+        config = _configure(prompt, camera, tracking, settings, output, performance)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    check_model_source(settings.model, source)
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), performance.split is not None)
     if not prompts and needs_prompt(config):
@@ -75,6 +80,8 @@ def run(
         configure = partial(_configure_in_browser, prompt, output, performance)
         menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
         prompts, config = _ask_in_browser(source, folder, video.frames, output.overwrite, menu)
+    from tracking3d.pipeline.record import RecordOptions
+
     options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
     request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
@@ -127,30 +134,34 @@ def _configure_in_browser(
 
 def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
+    from tracking3d.prompts.boxes import check_box_format
     from tracking3d.prompts.points import parse_points
     from tracking3d.prompts.prompt import PromptSet
     from tracking3d.video.selection import parse_selection
 
     start = prompt.start_frame
     first = start if start is not None else parse_selection(frames).start
-    boxes = [parse_given_box(text, first) for text in prompt.box or ()]
+    box_format = check_box_format(prompt.box_format)
+    boxes = [parse_given_box(text, first, box_format) for text in prompt.box or ()]
     masks = [one for file in prompt.mask or () for one in parse_given_masks(file)]
     points = [parse_points(text) for text in prompt.points or ()]
     several = len(boxes) + len(masks) + len(points) > 1
-    return PromptSet(boxes, masks, points, start, as_lists=several)
+    return PromptSet(boxes, masks, points, start, as_lists=several, box_format=box_format)
 
 
 def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
+    from tracking3d.prompts.boxes import check_box_format
     from tracking3d.prompts.corrections import parse_correction, validate_corrections
 
-    corrections = [parse_correction(text) for text in prompt.correct or ()]
+    box_format = check_box_format(prompt.box_format)
+    corrections = [parse_correction(text, box_format) for text in prompt.correct or ()]
     validate_corrections(corrections, max(objects, 1))  # before anything is written
     return corrections
 
 
 def _command() -> str:
     """The command line, for the record; without the passwords in it."""
-    from tracking3d.video.stream import without_password
+    from tracking3d.video.addresses import without_password
 
     return shlex.join(map(without_password, sys.argv))
 

@@ -137,7 +137,7 @@ def resumable(folders: list[Path]) -> Iterator[None]:
 
 def default_folder(source: str) -> Path:
     """``runs/<name>``, named after the file, the image folder, the camera, or the last part of an address."""
-    from tracking3d.video.stream import SCHEMES, scheme_of, without_password
+    from tracking3d.video.addresses import SCHEMES, scheme_of, without_password
 
     if source.isdigit() and not Path(source).exists():
         return Path("runs", f"camera_{source}")

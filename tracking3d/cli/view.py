@@ -49,13 +49,12 @@ def view(
 
     The page follows a run that is still running. Several runs are shown side by side.
     """
-    from tracking3d.cli.progress import load_with_progress, show_progress
-
-    load_with_progress("tracking3d.viewer.opening", quiet)
+    from tracking3d.cli.progress import show_progress
     from tracking3d.viewer.opening import check_viser, open_viewer
-    from tracking3d.web.access import Access
 
     check_viser("`tracking3d view`")
+    from tracking3d.web.access import Access
+
     with show_progress(quiet):
         report_progress("opening the viewer")
         viewer = open_viewer(runs, Access.on(host), port, source)

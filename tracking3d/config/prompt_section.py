@@ -5,7 +5,7 @@ It belongs to one video, not to the pipeline, so only ``run`` reads it.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -25,6 +25,10 @@ class PromptSection(Section):
 
     box: Texts = Field(
         (), description="Box X,Y,W,H of the object in the first frame, or a list for several objects."
+    )
+    box_format: Literal["xywh", "xyxy"] | None = Field(
+        None,
+        description="How boxes are written here: xywh (X,Y,WIDTH,HEIGHT, the default) or xyxy (X1,Y1,X2,Y2).",
     )
     mask: Texts = Field(
         (), description="Mask file of the object in the first frame, or a list for several objects."

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +18,14 @@ from tracking3d.datasets.truth import MaskFile, MaskReference, Truth
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.results import layout
-from tracking3d.results.correspondences import track_points
-from tracking3d.results.point_tracking import RunScene, has_landmarks, open_scene
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.selection import parse_selection, within
+
+if TYPE_CHECKING:
+    from tracking3d.results.point_tracking import RunScene
 
 LEAST_SHARED = 0.5
 """Minimum share of a run's frames that the clip must contain; with fewer, common indices are a coincidence."""
@@ -50,6 +52,8 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
     asked = _shift_range(parse_selection(run.description.get("selection")), offset, len(truth.frames))
     records = {record.index + offset: record for record in run.frames if record.index + offset in asked}
     _check_shared(run, records, truth, offset)
+    from tracking3d.results.point_tracking import has_landmarks  # slow to import
+
     memory = run.description.get("peak_memory_mb")
     seconds, stages = _times(run, records)
     has_mesh = (run.mesh_folder / layout.OBJ).is_file()
@@ -173,6 +177,8 @@ class _RunPoints:
 
     @cached_property
     def _scene(self) -> RunScene | None:
+        from tracking3d.results.point_tracking import open_scene
+
         return None if self.images is None else open_scene(self.run, self.images)
 
     def __call__(self, frame: int, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -183,6 +189,8 @@ class _RunPoints:
         record = next((one for one in self.run.frames if one.index == own), None)
         if record is None or record.status is Status.LOST or not is_rigid(record.T_cam_obj):
             return positions, visible  # where the object was not found, its points were not either
+        from tracking3d.results.correspondences import track_points
+
         scene = self._scene
         tracks = track_points(self.run, own, points) if scene is None else scene.track(own, points)
         frames = tracks.frames + self.offset

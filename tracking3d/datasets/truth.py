@@ -10,19 +10,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.gltf_axes import read_mesh_file
-from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.results.files import read_mask
+from tracking3d.trackers.crops import clip_box
+from tracking3d.video.image_file import read_image
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 class MaskReference(Protocol):
@@ -111,6 +113,9 @@ class MeshFile:
         Raises:
             InputError: If it is not a readable mesh.
         """
+        from tracking3d.geometry.gltf_axes import read_mesh_file  # slow to import
+        from tracking3d.geometry.mesh_checks import what_is_wrong
+
         try:
             mesh = read_mesh_file(self.path)
         except Exception as error:  # every format has errors of its own
@@ -170,3 +175,13 @@ class Truth:
     def names(self) -> tuple[str, ...]:
         """The frames' names without suffix."""
         return tuple(path.stem for path in self.frames)
+
+    def box_in_frame(self) -> Box | None:
+        """The part of `box` inside frame 0, which is what a tracker starts from.
+
+        Data sets often give the box of the whole object, also if a part of it is beyond the edge of the frame.
+
+        Raises:
+            InputError: Frame 0 cannot be read.
+        """
+        return self.box and (clip_box(self.box, read_image(self.frames[0]).shape) or self.box)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 
 from tracking3d.evaluation.arrays import booleans, check_shape, finite
 
@@ -113,6 +112,8 @@ def area_under_roc(score: ArrayLike, right: ArrayLike) -> float | None:
     good, bad = np.count_nonzero(was_right), np.count_nonzero(~was_right)
     if not good or not bad:
         return None
+    from scipy.stats import rankdata  # slow to import
+
     return float((rankdata(said)[was_right].sum() - good * (good + 1) / 2) / (good * bad))
 
 

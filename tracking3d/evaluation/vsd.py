@@ -8,11 +8,9 @@ estimation", ECCV 2018).
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.evaluation.arrays import finite, floats
-from tracking3d.rendering.visibility import rasterize
 
 TOLERANCES = np.arange(0.05, 0.51, 0.05)
 """``(10,)`` tau: misalignments in object diameters below which a pixel agrees."""
@@ -97,6 +95,10 @@ def model_depth(
     Raises:
         ValueError: If a shape does not fit or a value is not finite.
     """
+    import torch  # slow to import
+
+    from tracking3d.rendering.visibility import rasterize
+
     T, intrinsics = finite("T_cam_obj", T_cam_obj, 4, 4), finite("K", K, 3, 3)
     points = finite("vertices", vertices, None, 3) @ T[:3, :3].T + T[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):

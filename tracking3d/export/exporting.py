@@ -8,16 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
-from tracking3d.results.files import writing
-from tracking3d.results.layout import ARBITRARY, EXPORT, OVERWRITE, partial_path, run_files
-from tracking3d.results.run_reader import RunReader
+from tracking3d.export.other_names import similar_formats
+from tracking3d.results.layout import (
+    ARBITRARY,
+    EXPORT,
+    OVERWRITE,
+    check_run_folder,
+    partial_path,
+    run_files,
+)
 from tracking3d.runtime.progress import report_progress
+
+if TYPE_CHECKING:
+    from tracking3d.export.exported_run import ExportedRun
 
 FOLDER = EXPORT
 """Default folder of exports, in the run folder."""
@@ -77,9 +86,12 @@ def find_format(name: str) -> Exporter:
     Raises:
         InputError: If there is none; names those that there are.
     """
-    if name not in FORMATS:
-        raise InputError(f"There is no format {name}; {_TO} takes {', '.join(FORMATS)}.")
-    return FORMATS[name]
+    if name in FORMATS:
+        return FORMATS[name]
+    known = f"{_TO} takes {', '.join(FORMATS)}"
+    if similar := similar_formats(name, FORMATS):
+        raise InputError(f"There is no format {name} ({known}); did you mean {' or '.join(similar)}?")
+    raise InputError(f"There is no format {name}; {known}.")
 
 
 def export_run(
@@ -108,6 +120,11 @@ def export_run(
     exporter.check_options(options, _NAMED)
     _check(options)
     exporter.check_available()
+    check_run_folder(Path(run))
+    # Only now, because they need seconds to import.
+    from tracking3d.export.exported_run import ExportedRun
+    from tracking3d.results.run_reader import RunReader
+
     reader = RunReader(Path(run), refined=options.answers == "final")
     exported = ExportedRun(reader, options)
     path = reader.folder / FOLDER / exporter.default_name(exported) if out is None else Path(out).resolve()
@@ -191,6 +208,8 @@ def _is_export(folder: Path) -> bool:
 @contextmanager
 def _replace_when_done(path: Path) -> Iterator[Path]:
     """A path of the same name in a folder next to ``path``; what is there at a good end replaces ``path``."""
+    from tracking3d.results.files import writing
+
     workshop = partial_path(path)
     made, earlier = workshop / path.name, workshop / "earlier"
     with writing(path):

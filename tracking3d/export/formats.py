@@ -2,27 +2,56 @@
 
 from __future__ import annotations
 
-from tracking3d.export.after_effects import write_after_effects
-from tracking3d.export.animated_glb import write_animated_glb
-from tracking3d.export.blender import write_blender
-from tracking3d.export.bop_poses import write_bop_poses
-from tracking3d.export.coco import write_coco
-from tracking3d.export.colmap import write_colmap_binary, write_colmap_text
-from tracking3d.export.cut_outs import write_cut_outs, write_prores, write_vp9
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from tracking3d.export.exporter import Exporter
-from tracking3d.export.indexed_masks import write_davis, write_youtube_vos
-from tracking3d.export.kitti import write_kitti
-from tracking3d.export.model_files import write_glb, write_ply, write_stl
-from tracking3d.export.nerfstudio import write_nerfstudio
-from tracking3d.export.nuke import write_nuke
-from tracking3d.export.point_tracks import write_points_csv, write_tapvid
-from tracking3d.export.pose_table import write_csv, write_parquet
-from tracking3d.export.probability_pictures import write_probabilities, write_probabilities_16
-from tracking3d.export.rerun_recording import write_rerun
-from tracking3d.export.ros_bag import write_mcap, write_ros_bag
-from tracking3d.export.tum import write_tum
-from tracking3d.export.usdz import write_usdz
-from tracking3d.export.vot_masks import write_vot
+
+if TYPE_CHECKING:
+    from tracking3d.export.exported_run import ExportedRun
+
+
+def _writer(module: str, function: str) -> Callable[[ExportedRun, Path], object]:
+    """A function of a module in this package, which is imported when it is called: some need seconds for that."""
+
+    def write(run: ExportedRun, path: Path) -> object:
+        return getattr(import_module(f"tracking3d.export.{module}"), function)(run, path)
+
+    return write
+
+
+write_after_effects = _writer("after_effects", "write_after_effects")
+write_animated_glb = _writer("animated_glb", "write_animated_glb")
+write_blender = _writer("blender", "write_blender")
+write_bop_poses = _writer("bop_poses", "write_bop_poses")
+write_coco = _writer("coco", "write_coco")
+write_colmap_binary = _writer("colmap", "write_colmap_binary")
+write_colmap_text = _writer("colmap", "write_colmap_text")
+write_cut_outs = _writer("cut_outs", "write_cut_outs")
+write_prores = _writer("cut_outs", "write_prores")
+write_vp9 = _writer("cut_outs", "write_vp9")
+write_davis = _writer("indexed_masks", "write_davis")
+write_youtube_vos = _writer("indexed_masks", "write_youtube_vos")
+write_kitti = _writer("kitti", "write_kitti")
+write_glb = _writer("model_files", "write_glb")
+write_ply = _writer("model_files", "write_ply")
+write_stl = _writer("model_files", "write_stl")
+write_nerfstudio = _writer("nerfstudio", "write_nerfstudio")
+write_nuke = _writer("nuke", "write_nuke")
+write_points_csv = _writer("point_tracks", "write_points_csv")
+write_tapvid = _writer("point_tracks", "write_tapvid")
+write_csv = _writer("pose_table", "write_csv")
+write_parquet = _writer("pose_table", "write_parquet")
+write_probabilities = _writer("probability_pictures", "write_probabilities")
+write_probabilities_16 = _writer("probability_pictures", "write_probabilities_16")
+write_rerun = _writer("rerun_recording", "write_rerun")
+write_mcap = _writer("ros_bag", "write_mcap")
+write_ros_bag = _writer("ros_bag", "write_ros_bag")
+write_tum = _writer("tum", "write_tum")
+write_usdz = _writer("usdz", "write_usdz")
+write_vot = _writer("vot_masks", "write_vot")
 
 _LENGTHS = frozenset({"object_size"})
 _TIMED = _LENGTHS | {"fps"}

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-import torch
 from pydantic import BaseModel, ConfigDict, Field
-from torch import Tensor
-from torch.nn import functional
 
-from tracking3d.networks.session import Network
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _MULTIPLE = 16
 """The network downsamples images by two four times."""
@@ -36,6 +34,8 @@ class S2DNetEncoder:
         threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
 
     def __init__(self, threads: int = 1) -> None:
+        from tracking3d.networks.session import Network
+
         with resources.as_file(resources.files("tracking3d.features") / "weights" / "s2dnet.onnx") as file:
             self._network = Network(Path(file), threads)
 
@@ -46,6 +46,9 @@ class S2DNetEncoder:
 
     def encode(self, images: Tensor) -> Tensor:
         """Encode ``(B, 3, H, W)`` RGB in [0, 1] as ``(B, 128, H / 2, W / 2)``; sizes are rounded down."""
+        import torch
+        from torch.nn import functional
+
         height, width = images.shape[-2:]
         border = (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)
         padded = functional.pad(images, border, mode="replicate") if any(border) else images

@@ -13,10 +13,10 @@ from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
 from typing import IO
+from urllib.parse import urlsplit
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.networks.catalogue import KnownNetwork
-from tracking3d.networks.session import Network
 from tracking3d.networks.store import VARIABLE, network_path, sha256_of
 from tracking3d.networks.transfer import Listener, TransferError, transfer
 
@@ -71,9 +71,14 @@ def fetch(
 
 
 def _in_mirror(network: KnownNetwork, mirror: str) -> str:
-    if not mirror.startswith(("http://", "https://")):
+    try:
+        address = urlsplit(mirror)
+        valid = address.scheme in ("http", "https") and bool(address.hostname) and address.port != 0
+    except ValueError:  # brackets that do not match, or a port that is no number
+        valid = False
+    if not valid:
         raise InputError(
-            f"The mirror {mirror} is not an address; give one that begins with http:// or https://."
+            f"The mirror {mirror} is not an address; give one such as https://example.org/networks."
         )
     if network.sha256 is None or network.size is None:
         raise InputError(
@@ -139,6 +144,8 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
             )
         if network.sha256 is None:
             try:
+                from tracking3d.networks.session import Network  # slow to import
+
                 Network(Path(part.name))
             except InputError as error:
                 raise InputError(

@@ -21,6 +21,7 @@ from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture
+from tracking3d.results.initial_masks import is_initial_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -179,7 +180,7 @@ class ObjectRecorder:
             correction = self._state.checkpoint.correction(frame.index)
         prompts = prompts_in(frame, self._tracked.corrections)
         mask = self._session.replay(frame, first, correction, *prompts)
-        if self._warned or taken.failure or not mask or self._writer.is_initial_mask(frame, mask):
+        if self._warned or taken.failure or not mask or is_initial_mask(self._writer.folder, frame, mask):
             return
         self._warned = True
         _log.warning(

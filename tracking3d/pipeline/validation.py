@@ -13,7 +13,6 @@ from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, Prompt
 from tracking3d.pipeline.tracker_selection import AUTO
 from tracking3d.prompts.prompt import validate_box, validate_mask
-from tracking3d.video.image_input import check_image
 from tracking3d.video.source import FrameSource
 
 
@@ -40,6 +39,8 @@ def check_frame(frame: Any) -> None:
     """
     if not isinstance(frame, Frame):
         raise InputError(f"frame= is {a_kind(frame)}; wrap the image: Frame(index, image).")
+    from tracking3d.video.image_input import check_image
+
     check_image(frame.image, frame.name or f"Frame {frame.index}")
 
 

@@ -248,7 +248,9 @@ def _blame_plugin(label: str, but: type[Exception] = PluginFailure) -> Iterator[
         yield
     except but:
         raise
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # some extensions raise what is not an `Exception`
         raise PluginFailure(label, describe_exception(error)) from error
 
 

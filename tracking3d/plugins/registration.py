@@ -75,8 +75,11 @@ def import_plugin(plugin: Registered) -> type[Any]:
 
 
 def describe_exception(error: BaseException) -> str:
-    """An exception as one short line, without a full stop."""
-    text = " ".join(str(error).split()).rstrip(".")
+    """An exception as one short line, without a full stop; it may come from code that cannot even describe it."""
+    try:
+        text = " ".join(str(error).split()).rstrip(".")
+    except Exception as other:
+        return f"{type(error).__name__}, which cannot be described because of {type(other).__name__}"
     if not isinstance(error, Tracking3dError):
         text = f"{type(error).__name__}: {text}"
     return text if len(text) <= 300 else text[:297] + "..."

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from tracking3d.config.explain import describe_validation_error, nearest, unknown_key
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import PluginError, Tracking3dError
+from tracking3d.plugins.other_names import advice_on_name
 from tracking3d.plugins.registration import (
     FEATURES,
     KIND,
@@ -61,7 +62,9 @@ def list_plugins() -> list[PluginInfo]:
         else:
             try:
                 options = import_plugin(plugin).Options.model_json_schema()
-            except (Exception, SystemExit) as error:
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
                 status, reason = "broken", describe_exception(error)
         infos.append(
             PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
@@ -129,7 +132,9 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
         instance = _load(plugin).from_options(options)
     except Tracking3dError:
         raise
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise PluginError(f"{plugin.label} could not be started: {describe_exception(error)}.") from error
     if absent := [name for name in _ATTRIBUTES[group] if not hasattr(instance, name)]:
         raise PluginError(f"{plugin.label} is broken: it has no attribute {', '.join(absent)}.")
@@ -142,17 +147,19 @@ def _find(group: str, name: str) -> Registered:
         if plugin.name == name:
             return plugin
     installed = sorted({plugin.name for plugin in plugins})
-    best = nearest(name, installed)
-    advice = f"; did you mean '{best}'?" if best else "."
-    raise PluginError(
-        f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'}){advice}"
-    )
+    advice = advice_on_name(group, name)
+    if not advice and (best := nearest(name, installed)):
+        advice = f"did you mean '{best}'?"
+    missing = f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'})"
+    raise PluginError(f"{missing}; {advice}" if advice else f"{missing}.")
 
 
 def _load(plugin: Registered) -> type[Any]:
     try:
         return import_plugin(plugin)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # some extensions raise what is not an `Exception`
         raise PluginError(
             f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists working plug-ins."
         ) from error

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from tracking3d.config.explain import a_kind, format_value
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame, pixels
+from tracking3d.prompts.boxes import BoxFormat, check_box_fits, parse_box
 from tracking3d.prompts.points import check_points_inside, looks_like_points, parse_points, validate_points
-from tracking3d.prompts.prompt import make_prompt, parse_box, read_mask_file, validate_box, validate_mask
-from tracking3d.trackers.crops import clip_box
+from tracking3d.prompts.prompt import make_prompt, read_mask_file, validate_box, validate_mask
 
 CORRECT = argument("corrections=", "--correct ")
 """Their name in messages, before their values."""
@@ -40,6 +40,7 @@ class Correction:
         mask: ``(H, W)``, or its image file.
         points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background.
         object: Index of the object, counted from 0; needed if there are several.
+        box_format: How the user wrote the box; messages write it in the same way.
     """
 
     frame: int
@@ -47,6 +48,7 @@ class Correction:
     mask: NDArray[np.bool_] | Path | None = None
     points: Any = None
     object: int | None = None
+    box_format: BoxFormat = "xywh"
 
     @property
     def name(self) -> str:
@@ -59,8 +61,16 @@ class Correction:
         Raises:
             InputError: It cannot be used there.
         """
-        names = {"box_name": self.name, "mask_name": self.name, "points_name": self.name}
-        return make_prompt(frame, self.box, self.mask, points=self.points, **names)
+        return make_prompt(
+            frame,
+            self.box,
+            self.mask,
+            points=self.points,
+            box_name=self.name,
+            mask_name=self.name,
+            points_name=self.name,
+            box_format=self.box_format,
+        )
 
     def check_fits(self, size: tuple[int, int]) -> None:
         """Make sure that it fits a frame of ``size`` ``(height, width)``.
@@ -69,10 +79,8 @@ class Correction:
             InputError: It does not.
         """
         label = f"frame {self.frame}"
-        if self.box is not None and clip_box(self.box, size) is None:
-            raise InputError(
-                f"{self.name}{format_value(self.box)} lies outside {label}, which is {pixels(size)} pixels."
-            )
+        if self.box is not None:
+            check_box_fits(self.box, size, label, self.name, self.box_format)
         if isinstance(self.mask, np.ndarray) and self.mask.shape != size:
             raise InputError(
                 f"{self.name} the mask is {pixels(self.mask.shape)} pixels, but {label} is {pixels(size)}; the sizes "
@@ -88,8 +96,12 @@ def prompts_in(frame: Frame, corrections: Mapping[int, Correction]) -> list[Prom
     return [] if correction is None else [correction.prompt(frame)]
 
 
-def parse_correction(text: str) -> Correction:
+def parse_correction(text: str, box_format: BoxFormat = "xywh") -> Correction:
     """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, with or without ``@OBJECT`` after FRAME.
+
+    Args:
+        text: The correction.
+        box_format: How a box in it is written.
 
     Raises:
         InputError: The text is none of them.
@@ -102,7 +114,8 @@ def parse_correction(text: str) -> Correction:
     if looks_like_points(what):
         return Correction(frame, points=parse_points(what, name), object=number)
     if re.fullmatch(r"[-+.\deE,\s]+", what):
-        return Correction(frame, box=parse_box(what, name), object=number)
+        box = parse_box(what, name, box_format)
+        return Correction(frame, box=box, object=number, box_format=box_format)
     return Correction(frame, mask=Path(what), object=number)
 
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from tracking3d.config.explain import a_kind, format_value
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, Prompt, pixels
-from tracking3d.trackers.crops import box_of
-from tracking3d.trackers.mask_from_points import mask_from_points
 
 POINTS = argument("points=", "--points ")
 """Their name in messages, before their values."""
@@ -126,6 +124,9 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
     Raises:
         InputError: They cannot be used, or do not separate the object from the background.
     """
+    from tracking3d.trackers.crops import box_of
+    from tracking3d.trackers.mask_from_points import mask_from_points
+
     checked = validate_points(points, name)
     check_points_inside(checked, frame.size, frame.label, name)
     mask = mask_from_points(frame.image, checked) > 0.5

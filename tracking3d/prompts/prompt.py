@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +13,13 @@ from numpy.typing import NDArray
 from tracking3d.config.explain import a_kind, format_value
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
+from tracking3d.prompts.boxes import BOX, BoxFormat, fit_box, format_box, parse_box, validate_box
 from tracking3d.prompts.points import POINTS, points_prompt, validate_points
-from tracking3d.trackers.crops import box_of, clip_box
-from tracking3d.trackers.mask_images import ImageMasks, UnreadableMaskError, split_object
 
-_log = logging.getLogger(__name__)
+__all__ = ["PromptSet", "make_prompt", "parse_box", "validate_box", "validate_mask"]
 
-
-BOX = argument("box=", "--box ")
 MASK = argument("mask=", "--mask ")
-"""Names of the two in messages, before their values."""
+"""Name of a mask in messages, before its value."""
 
 _OPTIONS = {"boxes": "--box ", "masks": "--mask ", "points": "--points "}
 _SKIP = argument("skip_damaged=True", "--skip-damaged")
@@ -50,6 +45,7 @@ class PromptSet:
         start_frame: Index of the prompt frame; None for the first frame of the video.
         as_lists: Whether the user gave lists of boxes, masks and points, as of several objects. Messages then say
             which item is wrong.
+        box_format: How the user wrote the boxes; messages write them in the same way.
     """
 
     boxes: Sequence[Box] = ()
@@ -57,6 +53,7 @@ class PromptSet:
     points: Sequence[Any] = ()
     start_frame: int | None = None
     as_lists: bool = False
+    box_format: BoxFormat = "xywh"
 
     @classmethod
     def of_one(
@@ -113,7 +110,7 @@ class PromptSet:
             InputError: A prompt cannot be used in this frame, or the tracker reads the masks of one object only.
         """
         prompts: list[Prompt | None] = [
-            make_prompt(frame, box, box_name=self._name(BOX, "boxes", number))
+            make_prompt(frame, box, box_name=self._name(BOX, "boxes", number), box_format=self.box_format)
             for number, box in enumerate(self.boxes)
         ]
         prompts += [
@@ -137,21 +134,6 @@ class PromptSet:
         return argument(f"{several}[{number}]=", _OPTIONS[several])
 
 
-def parse_box(text: str, name: str = BOX) -> Box:
-    """Read ``X,Y,WIDTH,HEIGHT`` in pixels; messages call it ``name``.
-
-    Raises:
-        InputError: The text is not four numbers, or the size is not positive.
-    """
-    try:
-        x, y, width, height = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(
-            f"{name}'{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
-        ) from error
-    return validate_box((x, y, width, height), name)
-
-
 def make_prompt(
     frame: Frame,
     box: Box | None = None,
@@ -161,29 +143,33 @@ def make_prompt(
     box_name: str = BOX,
     mask_name: str = MASK,
     points_name: str = POINTS,
+    box_format: BoxFormat = "xywh",
 ) -> Prompt:
     """Make the prompt for ``frame``.
 
     Args:
         frame: The frame that is prompted.
-        box: ``(x, y, width, height)`` in pixels. The part outside the frame is cut off, with a
-            warning in the log.
+        box: ``(x, y, width, height)`` in pixels. If it reaches a few pixels beyond the frame, the part outside is cut
+            off, with a warning in the log.
         mask: ``(H, W)``, or its image file; the object is where it is not zero (in a file: above half).
         points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background; see `tracking3d.prompts.points`.
         box_name: Name of the box in messages, see `tracking3d.errors.argument`.
         mask_name: Name of the mask.
         points_name: Name of the points.
+        box_format: How the user wrote the box; messages write it in the same way.
 
     Raises:
-        InputError: None or more than one are given, the box has no size or lies outside the frame, the mask
-            cannot be read, is empty, covers everything or is not of the frame's size, or the points lie outside,
-            contradict each other, or none is on the object.
+        InputError: None or more than one are given, the box has no size, lies outside the frame or reaches far beyond
+            it, the mask cannot be read, is empty, covers everything or is not of the frame's size, or the points lie
+            outside, contradict each other, or none is on the object.
     """
     PromptSet.of_one(box, mask, points).check()
     if points is not None:
         return points_prompt(frame, points, points_name)
     if box is not None:
-        return Prompt(_inside(validate_box(box, box_name), frame, box_name))
+        return Prompt(fit_box(validate_box(box, box_name), frame, box_name, box_format))
+    from tracking3d.trackers.crops import box_of
+
     label = f"{mask_name}{mask if isinstance(mask, Path) else ''}"
     binary = read_mask_file(mask, label) if isinstance(mask, Path) else validate_mask(mask, mask_name)
     height, width = frame.size
@@ -214,6 +200,8 @@ def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:
     Raises:
         InputError: Its mask has another size, or its box lies outside.
     """
+    from tracking3d.trackers.crops import clip_box
+
     height, width = frame.size
     if prompt.mask is not None and np.shape(prompt.mask) != frame.size:
         raise InputError(
@@ -222,37 +210,8 @@ def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:
         )
     if clip_box(prompt.box, frame.size) is None:
         raise InputError(
-            f"prompt.box={_format(prompt.box)} lies outside {frame.label}, which is {width} x {height} pixels."
+            f"prompt.box={format_box(prompt.box)} lies outside {frame.label}, which is {width} x {height} pixels."
         )
-
-
-def validate_box(box: Any, name: str = BOX) -> Box:
-    """Four finite numbers, the last two positive.
-
-    Args:
-        box: ``(x, y, width, height)`` in pixels, of any kind of sequence.
-        name: Its name in messages.
-
-    Raises:
-        InputError: It is anything else.
-    """
-    try:
-        if isinstance(box, str | bytes | Mapping) or any(isinstance(value, str | bytes) for value in box):
-            raise TypeError
-        x, y, width, height = (float(value) for value in box)
-    except Exception as error:  # iterating over a foreign object can raise anything
-        raise InputError(
-            f"{name}{format_value(box)} is not four numbers x, y, width, height in pixels."
-        ) from error
-    if not all(math.isfinite(value) for value in (x, y, width, height)):
-        raise InputError(
-            f"{name}{_format((x, y, width, height))} has a value that is not a finite number; give four finite numbers."
-        )
-    if width <= 0 or height <= 0:
-        raise InputError(
-            f"{name}{_format((x, y, width, height))} has no size; its width and height must be positive."
-        )
-    return x, y, width, height
 
 
 def validate_mask(mask: Any, name: str = MASK) -> NDArray[np.bool_]:
@@ -283,23 +242,6 @@ def validate_mask(mask: Any, name: str = MASK) -> NDArray[np.bool_]:
     return values != 0
 
 
-def _inside(box: Box, frame: Frame, name: str) -> Box:
-    inside = clip_box(box, frame.size)
-    if inside is None:
-        height, width = frame.size
-        raise InputError(
-            f"{name}{_format(box)} lies outside {frame.label}, which is {width} x {height} pixels; "
-            "give the box as left edge, upper edge, width and height."
-        )
-    if inside != box:
-        _log.warning(
-            "The box %s extends beyond the frame; the part inside, %s, is used.",
-            _format(box),
-            _format(inside),
-        )
-    return inside
-
-
 def read_mask_file(file: Path, label: str) -> NDArray[np.bool_]:
     """Read the mask ``(H, W)`` in an image file, true where brighter than half; messages call it ``label``.
 
@@ -308,6 +250,8 @@ def read_mask_file(file: Path, label: str) -> NDArray[np.bool_]:
     Raises:
         InputError: It does not exist, or cannot be read.
     """
+    from tracking3d.trackers.mask_images import ImageMasks, UnreadableMaskError, split_object
+
     try:
         there = file.is_file()
         if not there:
@@ -325,7 +269,3 @@ def read_mask_file(file: Path, label: str) -> NDArray[np.bool_]:
         raise InputError(f"{label} cannot be read as an image.") from error
     assert mask is not None  # there is one file
     return mask
-
-
-def _format(box: Box) -> str:
-    return ",".join(f"{value:g}" for value in box)

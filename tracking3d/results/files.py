@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -115,6 +114,8 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
 
 def image_file(image: NDArray[np.uint8]) -> bytes:
     """``(H, W)`` grey or ``(H, W, 3)`` RGB uint8 as PNG."""
+    import cv2
+
     ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     return cv2.imencode(".png", ordered)[1].tobytes()
 
@@ -137,8 +138,13 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
 
 
 def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
-    """A mask from the bytes of such a file; None if they are no image."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    """A mask from the bytes of such a file; None if they are no image, or too large a one."""
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    except cv2.error:  # more pixels than OpenCV decodes
+        return None
     return None if image is None else image >= 128
 
 

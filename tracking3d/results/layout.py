@@ -28,7 +28,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from tracking3d.errors import OutputError, argument
+from tracking3d.errors import InputError, OutputError, argument
 
 FORMAT = "tracking3d-run"
 FORMAT_VERSION = 2
@@ -73,6 +73,7 @@ EXPORT_BEFORE = "export_before_correction"
 ARBITRARY, METRE = "arbitrary", "metre"
 """Units of length of a run: its own, and that of a run whose object was measured."""
 
+_RUN_FOLDER = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
 """Names in messages of the arguments of `tracking3d.pipeline.record.record` and of ``tracking3d run``."""
@@ -144,6 +145,17 @@ def runs_in(folder: Path) -> list[Path]:
         int(path.name.removeprefix("object_")): path for path in folder.glob("object_*") if _is_object(path)
     }
     return [found[number] for number in sorted(found)] or [folder]
+
+
+def check_run_folder(folder: Path) -> None:
+    """Make sure that a folder is a run folder, before what reads it is imported.
+
+    Raises:
+        InputError: It holds no ``run.json``.
+    """
+    if not (folder / RUN).is_file():
+        what = f"holds no {RUN}" if folder.is_dir() else "does not exist"
+        raise InputError(f"{folder} is not a run folder: it {what}; give {_RUN_FOLDER}.")
 
 
 def _is_object(folder: Path) -> bool:

@@ -225,12 +225,14 @@ def _mesh_fault(mesh: Any) -> str:
     """Why that is no surface, or nothing."""
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return "has no faces"
-    if not (np.abs(mesh.vertices) < _FARTHEST).all():
+    return _surface_fault(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _surface_fault(vertices: NDArray, faces: NDArray) -> str:
+    """Why vertices ``(V, 3)`` and faces ``(F, 3)`` are no surface, or nothing."""
+    if not (np.abs(vertices) < _FARTHEST).all():
         return "has vertices with invalid coordinates"
-    faces = np.asarray(mesh.faces)
-    return (
-        "has faces with missing vertices" if not 0 <= faces.min() <= faces.max() < len(mesh.vertices) else ""
-    )
+    return "has faces with missing vertices" if not 0 <= faces.min() <= faces.max() < len(vertices) else ""
 
 
 def load_model(folder: Path) -> ObjectModel:
@@ -243,11 +245,29 @@ def load_model(folder: Path) -> ObjectModel:
     try:
         with ArrayFile(path) as arrays, PillowImage.open(folder / TEXTURE) as image:
             texture: NDArray[np.uint8] = np.asarray(image.convert("RGB"))
-            return ObjectModel(texture=texture, **{name: arrays.read(name) for name in arrays.names})
+            model = ObjectModel(texture=texture, **{name: arrays.read(name) for name in arrays.names})
+            fault = _model_fault(model)
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(
             f"The model {path} cannot be read ({error}); track again into another {OUT}."
         ) from error
+    if fault:
+        raise InputError(f"The model {path} {fault}; track again into another {OUT}.")
+    return model
+
+
+def _model_fault(model: ObjectModel) -> str:
+    """Why that is no textured surface, or nothing."""
+    vertices, faces, uvs = model.vertices, model.faces, model.face_uvs
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
+        return "has no faces"
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or uvs.shape != (len(faces), 3, 2):
+        return (
+            f"has vertices {vertices.shape} and texture coordinates {uvs.shape}, which do not fit its faces"
+        )
+    if not np.isfinite(uvs).all():
+        return "has texture coordinates that are not finite"
+    return _surface_fault(vertices, faces)
 
 
 def restore_texture(folder: Path) -> bool:

@@ -13,7 +13,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
+from tracking3d.frames import pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
 from tracking3d.results.camera_record import camera_from_record
@@ -43,8 +44,6 @@ _KINDS: dict[str, Any] = {
     "unit": dict | None,
     "scaling": dict | None,
 }
-
-_RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 
 
 class FormatError(InputError):
@@ -179,13 +178,18 @@ class RunReader:
         """The estimated mask ``(H, W)`` of frame ``index``.
 
         Raises:
-            InputError: If there is none.
+            InputError: If there is none, or it is of another size than the frames.
         """
         path = self.mask_path(index)
         mask = read_mask(path)
         if mask is None:
             raise InputError(
                 f"The run {self.folder} has no mask of frame {index}; {path.name} is missing or damaged."
+            )
+        if mask.shape != (size := (self.camera.height, self.camera.width)):
+            raise InputError(
+                f"The mask {path} is {pixels(mask.shape)} pixels, but the frames of the run are {pixels(size)}; "
+                "restore it."
             )
         return mask
 
@@ -280,10 +284,8 @@ def _camera_fault(camera: Camera) -> str:
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
+    layout.check_run_folder(folder)
     path = folder / layout.RUN
-    if not path.is_file():
-        what = "holds no run.json" if folder.is_dir() else "does not exist"
-        raise InputError(f"{folder} is not a run folder: it {what}; give {_RUN}.")
     try:
         description = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:

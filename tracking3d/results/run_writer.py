@@ -15,11 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-import numpy as np
-
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
-from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
+from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.artefacts import check_complete
@@ -275,13 +273,6 @@ class RunWriter:
         if not self._over:
             ended: FinalState = "failed" if isinstance(error, Exception) else "interrupted"
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
-
-    def is_initial_mask(self, frame: Frame, estimate: MaskEstimate) -> bool:
-        """Whether a mask tracker's estimate for a frame is the one that is saved."""
-        kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), estimate.binary
-        if kept is None or given is None:
-            return all(mask is None or not mask.any() for mask in (kept, given))
-        return np.array_equal(kept, given)
 
     def _continue(self, so_far: WrittenSoFar) -> None:
         """Continue the run that is there."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 _BINS = (16, 12, 12)  # L, a, b
 _LOG_LIMIT = 3.0
@@ -123,6 +122,8 @@ class Palette:
     """
 
     def __init__(self, colours: NDArray[np.uint8], size: int = 40, stride: int = 3) -> None:
+        from scipy.spatial import cKDTree  # slow to import; the options of a tracker are checked without it
+
         samples = colours[::stride, ::stride].reshape(-1, 3)
         size = min(size, len(np.unique(samples.astype(np.int32) @ _PACKED)))
         cv2.setRNGSeed(0)  # k-means++ draws from OpenCV's generator

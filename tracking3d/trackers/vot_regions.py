@@ -6,7 +6,7 @@
     12,30,52,30,52,50,12,50          a polygon: x and y of its corners
     m12,30,3,2,1,2,3                 a mask: x, y, width and height of a box, then the lengths of runs in it, row by
                                      row, of 0 and 1 in turn, 0 first; what is left of the box is 0
-    0  or  nan,nan,nan,nan           no region
+    0  or  nan,nan,nan,nan           no region, and so is a rectangle without width or height
 
 Source: vot-toolkit, ``vot/region/io.py`` (https://github.com/votchallenge/toolkit).
 """
@@ -87,6 +87,9 @@ def parse_region(text: str) -> Region:
     if len(numbers) == 1:
         return Special(int(numbers[0]))
     if len(numbers) == 4:
+        if min(numbers[2:]) < 0:
+            written = ",".join(f"{number:g}" for number in numbers)
+            raise ValueError(f"the rectangle {written} has a negative width or height")
         return Rectangle(*numbers)
     if len(numbers) >= 6 and len(numbers) % 2 == 0:
         return Polygon(tuple(zip(numbers[::2], numbers[1::2], strict=True)))

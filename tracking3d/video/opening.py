@@ -5,23 +5,20 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterable
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
 from tracking3d.frames import Image
+from tracking3d.video.addresses import SCHEMES, check_source_name, scheme_of
 from tracking3d.video.array_source import ArraySource
+from tracking3d.video.given_rates import FPS, validate_fps
 from tracking3d.video.image_file import is_still_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.live_camera import LiveCamera
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
-from tracking3d.video.stream import SCHEMES, open_stream, scheme_of
+from tracking3d.video.stream import open_stream
 from tracking3d.video.video_file import VideoFile
-
-_FPS = argument("fps=", "--fps")
-LEAST_FPS, MOST_FPS = 0.001, 100_000.0
-"""Images per second: from one in a quarter of an hour to the fastest cameras."""
 
 
 def open_source(
@@ -40,13 +37,13 @@ def open_source(
         InputError: If there is nothing that can be read as frames, the selection is bad or empty, or ``fps`` is given
             for a source that has times of its own.
     """
-    selection, fps = parse_selection(frames), _validate_fps(fps)
+    selection, fps = parse_selection(frames), validate_fps(fps)
     if isinstance(source, str | Path):
         opened = _open_path(str(source), selection)
         if fps is None:
             return opened
         if not isinstance(opened, ImageSequence):
-            raise InputError(f"{opened.name} has its own time stamps; {_FPS} is for images only.")
+            raise InputError(f"{opened.name} has its own time stamps; {FPS} is for images only.")
         return replace(opened, rate=fps)
     if isinstance(source, Iterable):
         return ArraySource(source, selection, rate=fps)
@@ -55,22 +52,8 @@ def open_source(
     )
 
 
-def _validate_fps(fps: float | None) -> float | None:
-    if fps is None:
-        return None
-    number = isinstance(fps, Real) and not isinstance(fps, bool)
-    if not number or not LEAST_FPS <= fps <= MOST_FPS:
-        raise InputError(
-            f"{_FPS} {fps!r:.40} is not a frame rate; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
-        )
-    return float(fps)
-
-
 def _open_path(name: str, selection: range) -> FrameSource:
-    if not name.strip():
-        raise InputError(
-            "The source is empty; give a video file, a folder or pattern of images, or a camera number."
-        )
+    check_source_name(name)
     path = Path(name).expanduser()
     try:
         if path.is_dir():
@@ -81,19 +64,10 @@ def _open_path(name: str, selection: range) -> FrameSource:
         raise InputError(f"{name} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
     if name.isascii() and name.isdigit():
         return LiveCamera.open(int(name), selection)
-    if (scheme := scheme_of(name)) in SCHEMES:
+    if scheme_of(name) in SCHEMES:
         return open_stream(name, selection)
-    if scheme is not None and not glob.has_magic(name):
-        raise InputError(
-            f"{name} does not exist, and addresses with {scheme}: are not supported; give a path, or an "
-            f"address that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
-        )
-    if glob.has_magic(name):
-        found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
-        return ImageSequence.open(name, map(Path, found), selection)
-    raise InputError(
-        f"{name} does not exist; give a video file, a folder or pattern of images, or a camera number."
-    )
+    found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
+    return ImageSequence.open(name, map(Path, found), selection)
 
 
 def _open_file(name: str, path: Path, selection: range) -> VideoFile:

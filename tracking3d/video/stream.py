@@ -8,7 +8,6 @@ Nothing but these protocols and the common video formats is followed, whatever a
 from __future__ import annotations
 
 import logging
-import re
 import ssl
 import time
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from av.error import FFmpegError
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.video.addresses import scheme_of, without_password
 from tracking3d.video.deinterlacing import deinterlace
 from tracking3d.video.latest_frames import newest
 from tracking3d.video.picture_conversion import PictureConverter
@@ -32,8 +32,6 @@ from tracking3d.video.source import Intrinsics, check_frames
 from tracking3d.video.video_decoding import decode_pictures
 from tracking3d.video.video_file import VideoFile, describe_video, frame_of, video_stream
 
-SCHEMES = ("http", "https", "rtsp", "rtsps")
-"""Schemes of supported addresses."""
 OPENING, READING = 10.0, 10.0
 """Timeouts in seconds: for the first data of a server, and between two packets."""
 TRIES = 3
@@ -52,30 +50,14 @@ _FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,flv,mpegts,mpeg,mpegvideo,mpjpeg,mjpeg,hls,ogg,asf,m4v,h264,hevc,ivf,"
     "nut,mxf,rtsp,sdp"
 )
-_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 _log = logging.getLogger(__name__)
-
-
-def scheme_of(name: str) -> str | None:
-    """The scheme of an address, in small letters; None of what is no address, such as a path."""
-    found = _SCHEME.match(name)
-    return found[1].lower() if found else None
-
-
-def without_password(address: str) -> str:
-    """An address without the user's name and password, as messages and records have it; a path as it is."""
-    if scheme_of(address) not in SCHEMES:
-        return address
-    scheme, slashes, rest = address.partition("//")
-    server, slash, path = rest.partition("/")
-    return "".join((scheme, slashes, server.rpartition("@")[2], slash, path))
 
 
 def open_stream(address: str, selection: range = EVERY_FRAME) -> NetworkFile | LiveStream:
     """Open a video by its address.
 
     Args:
-        address: Beginning with one of `SCHEMES`.
+        address: Beginning with one of `tracking3d.video.addresses.SCHEMES`.
         selection: Wanted frame indices.
 
     Raises:

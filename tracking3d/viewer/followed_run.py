@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.geometry.camera import Camera
@@ -162,7 +163,10 @@ class FollowedRun:
         self._read += len(whole)
         for line in whole.splitlines():
             try:
-                self._lines.append(FrameRecord.from_json(line))
+                record = FrameRecord.from_json(line)
+                if np.isfinite(record.T_cam_obj).all() and not is_rigid(record.T_cam_obj):
+                    raise ValueError(f"the pose of frame {record.index} is not a rotation and a translation")
+                self._lines.append(record)
             except ValueError as error:
                 raise InputError(f"A line of {path} is damaged ({error}); remove it.") from error
         self.frames = {record.index: record for record in latest(self._lines)}

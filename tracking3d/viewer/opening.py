@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tracking3d.errors import InputError, PluginError
-from tracking3d.video.any_frame import FrameImages, frame_images
-from tracking3d.video.opening import open_source
-from tracking3d.viewer.followed_run import FollowedRun, open_followed_runs
-from tracking3d.viewer.run_images import OverlayPictures, images_of_run
-from tracking3d.web.access import Access
+from tracking3d.results.layout import check_run_folder, runs_in
 
 if TYPE_CHECKING:
+    from tracking3d.video.any_frame import FrameImages
+    from tracking3d.viewer.followed_run import FollowedRun
     from tracking3d.viewer.viewer import Viewer
+    from tracking3d.web.access import Access
 
 PORT = 8080
 """Where the viewer listens, or the next port that is free."""
@@ -55,7 +54,15 @@ def open_viewer(
         PluginError: If viser is not installed, or cannot be guarded.
     """
     check_viser("The viewer")
+    for folder in folders:
+        for run in runs_in(folder):
+            check_run_folder(run)
+    # Only now, because they need seconds to import.
+    from tracking3d.video.any_frame import frame_images
+    from tracking3d.video.opening import open_source
     from tracking3d.viewer.correcting import Corrections, RunCorrection
+    from tracking3d.viewer.followed_run import open_followed_runs
+    from tracking3d.viewer.run_images import images_of_run
     from tracking3d.viewer.viewer import Video, Viewer
 
     if images is None and source is not None:
@@ -73,6 +80,8 @@ def open_viewer(
 
 def _drawn_images_of(run: FollowedRun) -> FrameImages | None:
     """The frames in the overlay video of a run."""
+    from tracking3d.viewer.run_images import OverlayPictures
+
     run.look_again()
     try:
         return OverlayPictures(run.folder, list(run.frames), run.camera.height, run.camera.width)

@@ -9,8 +9,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
-from tracking3d.prompts.prompt import make_prompt
-from tracking3d.trackers.crops import box_of
+from tracking3d.prompts.prompt import make_prompt, validate_box
+from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.vot_regions import Polygon, rasterise
 
 
@@ -43,7 +43,8 @@ def prompt_of(region: Any, frame: Frame, offset: tuple[int, int] = (0, 0)) -> Pr
         InputError: If it is none of these, or marks nothing in the frame.
     """
     if isinstance(region, tuple) and len(region) == 4 and np.ndim(region) == 1:
-        return make_prompt(frame, box=region)
+        # The rectangle of a toolkit may reach beyond the frame.
+        return make_prompt(frame, box=clip_box(validate_box(region), frame.size) or region)
     try:
         if isinstance(region, list) and all(isinstance(point, tuple) for point in region):
             points = tuple((float(x), float(y)) for x, y in region)

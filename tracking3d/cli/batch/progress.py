@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
@@ -14,8 +15,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from tracking3d.batch.folder import BatchProgress as HowFar
-from tracking3d.batch.running import Happening, Listener
 from tracking3d.cli.remaining_time import duration_in_words
+
+if TYPE_CHECKING:
+    from tracking3d.batch.running import Happening, Listener
 
 _MOST_WORKERS = 32
 """Most lines of workers on the terminal."""

@@ -16,6 +16,8 @@ import typer
 from tracking3d.cli.evaluate.options import Address, Sequences
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
 from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+from tracking3d.cli.options.prompt import BoxFormat
+from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.batch.rows import VideoRow
@@ -125,6 +127,7 @@ def run(
     *,
     data: Data = None,
     sequences: Sequences = None,
+    box_format: BoxFormat = None,
     settings: SettingsOptions,
     out: Out,
     overwrite: Overwrite = False,
@@ -141,27 +144,42 @@ def run(
     To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html
     grow as videos finish. The exit code is 1 if a video failed.
     """
-    from tracking3d.cli.progress import load_with_progress
-
-    load_with_progress("tracking3d.batch.running", quiet or as_json, kernels=True)
-    from tracking3d.batch.listing import dataset_jobs, list_jobs
-    from tracking3d.batch.running import run_batch
-    from tracking3d.batch.storage import absolute
-    from tracking3d.benchmark.sequences import open_dataset
-    from tracking3d.cli.batch.progress import show_batch_progress
-    from tracking3d.engines.choosing import open_engine
+    from tracking3d.prompts.boxes import check_box_format
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
+    written = check_box_format(box_format or "xywh")
+    if sequences and data is None:
+        raise InputError(
+            "--sequence names sequences of a dataset; give its folder with --data, or leave it out."
+        )
+    if split is not None:
+        from tracking3d.submaps.cuts import parse_length
+
+        parse_length(split, 1e9)  # refuses what is no length at any frame rate
     # Fail once for a wrong option, not once per video.
     config = settings.configure(runtime=_runtime(engine.threads))
+    from tracking3d.batch.listing import dataset_jobs, list_jobs
+
     if split is not None:
         _check_split(split, config, out, data, engine.address)
     if data is not None:
+        from tracking3d.benchmark.sequences import open_dataset
+
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
-        videos = list_jobs(jobs, lambda row: _build_config(row, settings, engine.threads), split or "")
+        videos = list_jobs(
+            jobs, lambda row: _build_config(row, settings, engine.threads), split or "", written
+        )
         _check_prompts(jobs, videos, quiet)
+    from tracking3d.cli.progress import load_with_progress
+
+    load_with_progress("tracking3d.batch.running", quiet or as_json, kernels=True)
+    from tracking3d.batch.running import run_batch
+    from tracking3d.batch.storage import absolute
+    from tracking3d.cli.batch.progress import show_batch_progress
+    from tracking3d.engines.choosing import open_engine
+
     needs = _needs(videos, engine)
     with (
         open_engine(engine.address, engine.workers, needs) as workers,
@@ -226,12 +244,9 @@ def _check_split(
     split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
 ) -> None:
     from tracking3d.batch.storage import local
-    from tracking3d.errors import InputError
-    from tracking3d.submaps.cuts import parse_length
     from tracking3d.submaps.job import refuse_what_cannot_be_joined
 
     refuse_what_cannot_be_joined(settings)
-    parse_length(split, 1e9)  # refuses what is no length at any frame rate
     if data is not None:
         raise InputError("--split cuts videos, but --data gives sequences of a dataset; leave out --split.")
     if address is not None and local(out) is None:

@@ -24,12 +24,14 @@ def live(
     import json
     from dataclasses import asdict
 
-    from tracking3d.benchmark.live import format_live, play_live
     from tracking3d.cli.options import configure
-    from tracking3d.cli.tables import print_table
     from tracking3d.datasets.clip import read_truth
 
-    report = play_live(configure(config, preset, overrides), read_truth(clip), seconds, rate)
+    settings, truth = configure(config, preset, overrides), read_truth(clip)
+    from tracking3d.benchmark.live import format_live, play_live
+    from tracking3d.cli.tables import print_table
+
+    report = play_live(settings, truth, seconds, rate)
     if as_json:
         typer.echo(json.dumps(asdict(report)))
     else:

@@ -64,26 +64,26 @@ def masks(
     """
     import json
 
-    import cv2
-
-    from tracking3d.benchmark.mask_table import format_masks, report
-    from tracking3d.benchmark.mask_trackers import Contestant, measure_trackers
-    from tracking3d.benchmark.mask_trackers import ablation as switched_off
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.cli.evaluate.progress import making_progress
     from tracking3d.cli.options import configure
-    from tracking3d.cli.tables import print_table
 
     chosen = [
         configure(config, preset, overrides, tracker=None if one is None else {"name": one}).tracker
         for one in dict.fromkeys(tracker or (None,))
     ]
+    with making_progress(quiet or as_json) as made:
+        dataset = open_dataset(name, data, out, 1, made).only(sequences or [])
+    import cv2
+
+    from tracking3d.benchmark.mask_table import format_masks, report
+    from tracking3d.benchmark.mask_trackers import Contestant, measure_trackers
+    from tracking3d.benchmark.mask_trackers import ablation as switched_off
+    from tracking3d.cli.tables import print_table
+
     contestants = [Contestant.of(choice) for choice in chosen]
     if ablation:
         contestants = [one for contestant in contestants for one in switched_off(contestant)]
-    with making_progress(quiet or as_json) as made:
-        dataset = open_dataset(name, data, out, 1, made).only(sequences or [])
-
     cv2.setNumThreads(threads)
     silent = quiet or as_json
     heard = (lambda measured: None) if silent else _print_measured

@@ -58,6 +58,9 @@ def score_answers(
     import json
     from dataclasses import asdict
 
+    if not truth.is_dir():
+        raise InputError(f"There is no clip folder {truth}; give the folder which holds frames/ and masks/.")
+    settings = _read_options(options)
     from tracking3d.cli.tables import print_table
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score
@@ -67,7 +70,7 @@ def score_answers(
 
     known = read_truth(truth)
     refined = answers is EstimateKind.final
-    given, kind = open_answers(results, known, form, refined=refined, offset=offset, **_read_options(options))
+    given, kind = open_answers(results, known, form, refined=refined, offset=offset, **settings)
     if form is None and not as_json:
         typer.echo(f"{results} is read as {kind}.", err=True)
     if not as_json:

@@ -54,6 +54,10 @@ def score_models(
     """
     import json
 
+    from tracking3d.results.layout import check_run_folder
+
+    for run in runs:
+        check_run_folder(run)
     from rich.markup import escape
     from rich.table import Table
 

@@ -43,6 +43,7 @@ def suite(
 
     Writes the scores to DIR/results/LABEL-NAME.json, and keeps the runs in DIR/runs.
     """
+    settings = configure(config, preset, overrides, quality)
     from tracking3d.benchmark.results import format_results, write_results
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.benchmark.suite import run_suite
@@ -53,7 +54,6 @@ def suite(
 
     check_masks(masks)
     name, specs = draw_suite(name, seed, count, meshes)
-    settings = configure(config, preset, overrides, quality)
     called = label or name_of_settings(config, quality or preset, overrides, masks)
     variant = Variant(label=called, config=settings, masks=masks)
     with making_progress(quiet) as made:

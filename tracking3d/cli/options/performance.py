@@ -53,7 +53,11 @@ class PerformanceOptions:
         """Make sure that the options go together.
 
         Raises:
-            InputError: Two of them do not.
+            InputError: Two of them do not, or the length of the parts is none.
         """
         if self.workers is not None and self.split is None:
             raise InputError("--workers is the number of parts that --split tracks at a time; add --split.")
+        if self.split is not None:
+            from tracking3d.submaps.cuts import parse_length
+
+            parse_length(self.split, 1e9)  # refuses what is no length at any frame rate

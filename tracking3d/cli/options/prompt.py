@@ -20,6 +20,14 @@ Box = Annotated[
         rich_help_panel=PROMPT,
     ),
 ]
+BoxFormat = Annotated[
+    str | None,
+    typer.Option(
+        metavar="xywh|xyxy",
+        help="How boxes are written: X,Y,WIDTH,HEIGHT, the default, or X1,Y1,X2,Y2.",
+        rich_help_panel=PROMPT,
+    ),
+]
 Mask = Annotated[
     list[Path] | None,
     typer.Option(
@@ -77,6 +85,7 @@ class PromptOptions:
     """What the objects are: at most one of ``box``, ``mask`` and ``points``, or what makes them unnecessary."""
 
     box: Box = None
+    box_format: BoxFormat = None
     mask: Mask = None
     points: Points = None
     masks: Masks = None
@@ -88,9 +97,11 @@ class PromptOptions:
         """The same, with what the section ``prompt`` of a configuration file gives if the options do not.
 
         Raises:
-            InputError: More than one kind of prompt is given, or the file cannot be read.
+            InputError: More than one kind of prompt is given, the format of boxes is unknown, or the file cannot be
+                read.
         """
         from tracking3d.config.loading import load_prompt
+        from tracking3d.prompts.boxes import check_box_format
 
         in_file = load_prompt(config)
         given = self
@@ -104,4 +115,11 @@ class PromptOptions:
         if sum(map(bool, (given.box, given.mask, given.points))) > 1:
             raise InputError("Give only one of --box, --mask and --points.")
         start_frame = in_file.start_frame if self.start_frame is None else self.start_frame
-        return replace(given, start_frame=start_frame, correct=self.correct or list(in_file.correct))
+        if start_frame is not None and start_frame < 0:
+            raise InputError(f"--start-frame {start_frame} is not a frame index; frames count from 0.")
+        return replace(
+            given,
+            box_format=check_box_format(self.box_format or in_file.box_format or "xywh"),
+            start_frame=start_frame,
+            correct=self.correct or list(in_file.correct),
+        )

@@ -80,12 +80,16 @@ def configure(
     """
     from tracking3d.config.choices import check_model, set_model
     from tracking3d.config.loading import load_config
-    from tracking3d.pipeline.tracker_selection import check_tracker_options
-    from tracking3d.plugins import FEATURES, check_options
+    from tracking3d.pipeline.tracker_selection import AUTO, check_tracker_options
+    from tracking3d.plugins import FEATURES, TRACKERS, check_options, plugin_label
 
     config = load_config(file, preset, overrides or (), quality=quality, **_without_none(direct))
     if model is not None:
         config = set_model(config, check_model(model))
+    # First by name alone: the options of plug-ins are checked by the plug-ins, which take seconds to import.
+    if config.tracker.name != AUTO:
+        plugin_label(TRACKERS, config.tracker.name)
+    plugin_label(FEATURES, config.features.name)
     check_tracker_options(config)
     check_options(FEATURES, config.features)
     return config

@@ -110,6 +110,8 @@ def _estimate(file: Path, number: int, row: list[str]) -> _Estimate:
         raise InputError(
             f"Line {number} of {file} is not {','.join(COLUMNS)} with nine numbers in R and three in t; correct it."
         ) from error
+    if not np.isfinite(pose).all():
+        raise InputError(f"Line {number} of {file} has a pose with values that are not finite; remove it.")
     if not (math.isfinite(one.score) and math.isfinite(one.seconds)):
         raise InputError(f"Line {number} of {file} has a score or time that is not finite; correct it.")
     return one

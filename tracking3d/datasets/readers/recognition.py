@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
+from pydantic import TypeAdapter, ValidationError
+
+from tracking3d.config.explain import format_value, hint
 from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.readers.bop_csv import answers_from_bop_csv
 from tracking3d.datasets.readers.colmap import answers_from_colmap
@@ -58,14 +63,40 @@ def read_answers(path: Path, truth: Truth, format: str | None = None, **options:
     """
     name = recognise_format(path) if format is None else format
     if name not in ANSWER_FORMATS:
-        raise InputError(f"There is no format '{name}'; choose one of {', '.join(ANSWER_FORMATS)}.")
+        raise InputError(
+            f"There is no format '{name}' (known are {', '.join(ANSWER_FORMATS)}); {hint(name, ANSWER_FORMATS)}"
+        )
     known = ANSWER_FORMATS[name]
-    try:
-        return known.read(path, truth, **options), known.title
-    except TypeError as error:
-        if "unexpected keyword" not in str(error):
-            raise
-        raise InputError(f"{path} is {known.title}, which has no such option ({error}).") from error
+    return known.read(path, truth, **_checked(options, path, known)), known.title
+
+
+def _checked(options: Mapping[str, Any], path: Path, known: AnswerFormat) -> dict[str, Any]:
+    """The options, each of the type that the format's function takes; several numbers may be a text with commas."""
+    hints = get_type_hints(known.read)
+    kinds = {name: hints[name] for name in list(inspect.signature(known.read).parameters)[2:]}
+    checked = {}
+    for name, value in options.items():
+        if name not in kinds:
+            raise InputError(
+                f"{path} is {known.title}, which has no such option ({name}); {hint(name, kinds)}"
+            )
+        spellings = [value, value.split(",")] if isinstance(value, str) and "," in value else [value]
+        try:
+            checked[name] = _first_valid(TypeAdapter(kinds[name]), spellings)
+        except ValidationError as error:
+            wanted = error.errors()[0]["msg"].removeprefix("Input should be ")
+            raise InputError(
+                f"The option {name} of {known.title} cannot be {format_value(value)}: it must be {wanted}."
+            ) from error
+    return checked
+
+
+def _first_valid(kind: TypeAdapter[Any], spellings: list[Any]) -> Any:
+    """The first of ``spellings`` that is of that type; raises pydantic's error about the last if none is."""
+    for value in spellings[:-1]:
+        with suppress(ValidationError):
+            return kind.validate_python(value)
+    return kind.validate_python(spellings[-1])
 
 
 def recognise_format(path: Path) -> str:

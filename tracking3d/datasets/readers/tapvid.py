@@ -84,6 +84,9 @@ def answers_from_tapvid(
     arrays = _of_clip(_load(file, height * width * len(truth.frames)), file, truth, name)
     tracks = _array(arrays, ("tracks", "points"), file, (None, len(truth.frames), 2))
     occluded = _array(arrays, ("occluded", "occlusion"), file, tracks.shape[:2]) > 0
+    if not np.isfinite(tracks).all(2).any():
+        what = "no tracks" if not len(tracks) else "no track with a finite position"
+        raise InputError(f"{file} has {what}, so there is nothing to score; export the tracks again.")
     queries = None
     if "query_points" in arrays:
         queries = _array(arrays, ("query_points",), file, (len(tracks), 3))
@@ -167,6 +170,8 @@ def _raster(
 ) -> NDArray[np.float64]:
     """Width and height that positions are relative to."""
     if raster is not None:
+        if min(raster) <= 0:
+            raise InputError(f"A raster of {raster[0]} x {raster[1]} has no size; give its width and height.")
         return np.array(raster, dtype=np.float64)
     finite = tracks[np.isfinite(tracks)]
     if not finite.size or np.quantile(np.abs(finite), 0.9) <= 1:
