@@ -96,11 +96,11 @@ def check_model_source(model: str | None, source: str) -> None:
     Raises:
         InputError: The source is a camera, whose frames cannot be read twice, or a package is missing.
     """
-    from tracking3d.reconstruction.rebuild import check_packages
-
     if model in ("fast", "fine") and source.isdigit() and not Path(source).exists():
         raise InputError(
             f"--model {model} reads the video a second time, which a camera does not allow; leave it out."
         )
     if model == "fine":
+        from tracking3d.reconstruction.rebuild import check_packages
+
         check_packages()

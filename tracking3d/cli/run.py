@@ -67,7 +67,6 @@ def run(
     corrections = _parse_corrections(prompt, len(prompts))
     with show_progress(quiet):  # plug-ins are imported to check their options
         config = _configure(prompt, camera, tracking, settings, output, performance)
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     check_model_source(settings.model, source)
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), performance.split is not None)
@@ -77,9 +76,11 @@ def run(
                 "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
                 "--masks DIR, or draw it with `tracking3d pick`."
             )
+        load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
         configure = partial(_configure_in_browser, prompt, output, performance)
         menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
         prompts, config = _ask_in_browser(source, folder, video.frames, output.overwrite, menu)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.pipeline.record import RecordOptions
 
     options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
