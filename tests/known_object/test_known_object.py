@@ -175,11 +175,10 @@ def refused(*arguments: object) -> str:
     [
         (("--model", "fine"), "are fixed"),
         (("--model", "fast"), "are fixed"),
-        (("--split", "4f"), "leave out --split, or --object"),
+        (("--split", "40f"), "leave out --split, or --object"),
         (("--box", "1,2,30,40", "--box", "50,60,30,40"), "2 objects are given"),
         (("--flat",), "flat or not"),
         (("--preset", "paper"), "the solver paper"),
-        ((), "does not exist"),
     ],
 )
 def test_what_does_not_go_together_is_refused(tmp_path, monkeypatch, more, sentence):
@@ -189,8 +188,15 @@ def test_what_does_not_go_together_is_refused(tmp_path, monkeypatch, more, sente
     with VideoWriter(tmp_path / "clip.mp4", 10, (48, 64)) as writer:
         for _ in range(2):
             writer.write(np.zeros((48, 64, 3), np.uint8))
-    assert sentence in refused("run", "clip.mp4", "--object", "nowhere", "--out", "run", *more)
+    (tmp_path / "known").mkdir()
+    assert sentence in refused("run", "clip.mp4", "--object", "known", "--out", "run", *more)
     assert not (tmp_path / "run").exists()
+
+
+def test_an_object_that_is_nowhere_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.mp4").touch()
+    assert "nowhere does not exist" in refused("run", "clip.mp4", "--object", "nowhere", "--out", "run")
 
 
 def test_the_library_says_what_it_cannot_take(clip):

@@ -129,7 +129,7 @@ def test_what_shows_the_mesh_is_made_again_if_the_run_has_it(tmp_path, monkeypat
     for name in {"report.html", "turntable.mp4"} - set(has):
         (run / name).unlink(missing_ok=True)
     before = {name: (run / name).read_bytes() for name in has}
-    result = CliRunner().invoke(app, ["model", str(run), "--quality", "fine"])
+    result = CliRunner().invoke(app, ["model", str(run), "--model", "fine"])
     assert result.exit_code == 0, result.output
     after = {name: (run / name).read_bytes() for name in has}
     assert all(after[name] != before[name] for name in has)
