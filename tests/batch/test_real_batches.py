@@ -136,7 +136,7 @@ def test_parts_of_a_long_video_are_tracked_by_all_workers_and_joined(tmp_path):
         if one.about.get("attempt") and one.about.get("step")
     }
     assert began["part 1 of 2"] != began["part 2 of 2"]
-    assert began["second look 1 of 2"] != began["second look 2 of 2"]
+    assert began["refinement pass 1 of 2"] != began["refinement pass 2 of 2"]
     run = RunReader(tmp_path / "out/long")
     assert run.state == "finished" and len(run.frames) == 50 and run.description["split"]["alignments"]
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])

@@ -1,4 +1,4 @@
-"""The final refinement of a file: a second look at every frame, and the causal answers beside it, whole."""
+"""The final refinement of a file: every frame is estimated again, and the causal estimates stay whole."""
 
 from __future__ import annotations
 
