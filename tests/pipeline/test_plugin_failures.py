@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -265,6 +266,16 @@ def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path, settings
     reader = RunReader(tmp_path / "run")
     assert (reader.state, [frame.index for frame in reader.frames]) == ("failed", [0, 1])
     assert "no pixels" in reader.description["error"]
+
+
+def test_nothing_reads_any_more_once_a_run_has_failed(clip, source, tmp_path, settings):
+    """Whoever keeps the error keeps its frames alive, and with them whatever is only left to be forgotten."""
+    before = set(threading.enumerate())
+    with pytest.raises(PluginError) as caught:
+        record(source, settings("stop", tracker=bad("raises", 2)), tmp_path / "run", mask=clip.masks[0])
+    left = [one.name for one in set(threading.enumerate()) - before]
+    assert caught.value.__traceback__ is not None
+    assert not [name for name in left if name.startswith("tracking3d-reading")]
 
 
 def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(

@@ -18,8 +18,8 @@ In short::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.pipeline.final_refinement import FinalRefinement
@@ -113,12 +113,12 @@ def run_passes(
             threads.enter_context(recording.writing_beside())
         try:
             waits = any(one.needs_first_pass for one in active)
-            arriving = report_each("tracking", read_with_next(source, frames), source.count)
-            for frame, coming in arriving if waits else ():
-                shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
-                for recording in active:
-                    with active.guard(recording):
-                        active.tell(recording.take(shared, coming))
+            with closing(report_each("tracking", read_with_next(source, frames), source.count)) as arriving:
+                for frame, coming in arriving if waits else ():
+                    shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
+                    for recording in active:
+                        with active.guard(recording):
+                            active.tell(recording.take(shared, coming))
             _finish_writing(active)
             if first_pass_only:
                 for recording in active:
@@ -145,11 +145,11 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         for recording in active:
             with active.guard(recording):
                 recording.begin_refinement(source)
-        again = _read_again("refining frames", source)
-        for frame in again if any(one.needs_second_pass for one in active) else ():
-            for recording in active:
-                with active.guard(recording):
-                    active.tell(recording.take_again(with_share(frame, objects)))
+        with closing(_read_again("refining frames", source)) as again:
+            for frame in again if any(one.needs_second_pass for one in active) else ():
+                for recording in active:
+                    with active.guard(recording):
+                        active.tell(recording.take_again(with_share(frame, objects)))
         _finish_writing(active)
         _run_last_passes(source, active)
         for recording in active:
@@ -163,22 +163,23 @@ def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
         with active.guard(recording):
             refinement.adjust_all()
     decides_masks = any(each.decides_masks for _, each in active.refining())
-    for frame in _read_again("collecting masks", source) if decides_masks else ():
-        for recording, refinement in active.refining():
-            with active.guard(recording):
-                refinement.collect_mask(frame)
+    with closing(_read_again("collecting masks", source)) as again:
+        for frame in again if decides_masks else ():
+            for recording, refinement in active.refining():
+                with active.guard(recording):
+                    refinement.collect_mask(frame)
     for recording, refinement in active.refining():
         with active.guard(recording):
             refinement.settle_masks()
-    last = _read_again("refining masks" if decides_masks else "drawing", source)
-    for frame in last if any(active.refining()) else ():
-        for recording, refinement in active.refining():
-            with active.guard(recording):
-                refinement.draw(frame)
+    with closing(_read_again("refining masks" if decides_masks else "drawing", source)) as again:
+        for frame in again if any(active.refining()) else ():
+            for recording, refinement in active.refining():
+                with active.guard(recording):
+                    refinement.draw(frame)
     _finish_writing(active)
 
 
-def _read_again(stage: str, source: FrameSource) -> Iterator[Frame]:
+def _read_again(stage: str, source: FrameSource) -> Generator[Frame]:
     """The frames once more, each a step of a stage."""
     return report_each(stage, read_again(source), source.count)
 

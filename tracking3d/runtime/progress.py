@@ -13,7 +13,7 @@ what they did.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Generator, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ def report_progress(name: str, done: int = 0, total: int | None = None) -> None:
         listener(StageProgress(name, done, total))
 
 
-def report_each(name: str, items: Iterable[T], total: int | None = None) -> Iterator[T]:
+def report_each(name: str, items: Iterable[T], total: int | None = None) -> Generator[T]:
     """The same items; the stage begins with the first, and each is a step that is done when the next is asked for.
 
     Args:
