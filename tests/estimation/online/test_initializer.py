@@ -120,7 +120,7 @@ def test_points_that_do_not_tell_give_way_to_turning_at_last(asked):
 def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(asked):
     state, start = try_initialize(belief_of([0.0] * 41), CONFIG)
     assert start is None
-    assert "still" in state.waiting_reason
+    assert state.waiting_reason == "the object has not moved yet"
     indices = [view.index for view, _ in state.pending]
     assert len(indices) == 21
     assert (indices[0], indices[-1]) == (0, 80)
@@ -128,16 +128,30 @@ def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(ask
     assert not asked["turning"]
 
 
+def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):
+    """A hand that comes, or light, changes the pixels of a thing that stands on a table."""
+    monkeypatch.setattr(initializer, "_has_changed", lambda views: True)
+    state, start = try_initialize(belief_of([0.0] * 41), CONFIG)
+    assert start is None
+    assert not asked["turning"]
+    assert state.pending is not None
+
+
 def test_points_that_are_gone_without_having_moved_tell_no_shape(asked):
+    """From where the object is seen with points again, the wait begins again."""
     given = belief_of([0.0] * 14)
-    view, estimate = given.pending[-1]
-    bare = replace(view, points=view.points.only(view.points.landmark < 2))
-    state, start = try_initialize(replace(given, pending=(*given.pending[:-1], (bare, estimate))), CONFIG)
+    kept = [
+        (replace(view, points=view.points.only(view.points.landmark < 2)), estimate)
+        if place >= 11
+        else (view, estimate)
+        for place, (view, estimate) in enumerate(given.pending)
+    ]
+    state, start = try_initialize(replace(given, pending=tuple(kept)), CONFIG)
     assert start is None
     assert not asked["points"]
     assert not asked["turning"]
-    assert "still" in state.waiting_reason
-    assert len(state.pending) == 14
+    assert state.waiting_reason == "the object has not moved yet"
+    assert [view.index for view, _ in state.pending] == [22, 24, 26]
 
 
 IMAGE, MASK = speckle(), disc((200, 240), (110, 100), 60)

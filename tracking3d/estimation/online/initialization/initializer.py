@@ -53,6 +53,7 @@ _DECISIVE_MOTION = 0.3  # deformation from which more motion decides nothing
 _WELL_TRACKED = 0.25  # bundle cost of points that are tracked well
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
+_NOT_MOVED = "the object has not moved yet"
 _STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
 
 
@@ -130,6 +131,10 @@ def try_initialize(
     motion = image_deformation(tracks_of(views, names[~state.object_map.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
+    # A textured object whose points keep their arrangement has not turned, however much covers it or moves with it.
+    if motion < MOTION and not ended and (shared <= _MIN_SHARED or len(views) >= _MAX_PENDING):
+        kept = _recent_frames(waiting) if shared <= _MIN_SHARED else _subsample(waiting)
+        return replace(state, pending=kept, waiting_reason=_NOT_MOVED, ambiguous_frames=0), None
     waited = ended or len(views) >= _MAX_PENDING
     # Points that fail do not gain from more motion: pixels and outlines are used instead.
     wild = motion > _MAX_DEFORMATION and len(views) >= _MIN_FRAMES_WITHOUT_POINTS
@@ -231,6 +236,18 @@ def _has_changed(views: list[Keyframe]) -> bool:
 
     neighbours = [difference(a, b) for a, b in pairwise(views)]
     return difference(views[0], views[-1]) > _NOISE_FACTOR * float(np.median(neighbours))
+
+
+def _recent_frames(
+    waiting: tuple[tuple[Keyframe, FrameEstimate], ...],
+) -> tuple[tuple[Keyframe, FrameEstimate], ...]:
+    """The last pending frames, from the first on that shares enough points with the last."""
+    newest = waiting[-1][0].points.landmark
+    for place, (view, _) in enumerate(waiting):
+        there = np.isin(view.points.landmark, newest)
+        if view.mask is not None and len(there) and there.mean() > _MIN_TRACKED_SHARE:
+            return waiting[place:]
+    return waiting[-1:]
 
 
 def _subsample(
