@@ -43,7 +43,7 @@ ONLINE_FLOORS = [
     {"masks"},
     {"relocalization"},
     {"atlas"},
-    {"frame_tracker"},
+    {"first_estimates", "frame_tracker"},
     {"continued_refinement"},
     {"user_guidance"},
     {"solver"},

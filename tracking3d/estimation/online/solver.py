@@ -47,10 +47,10 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 )
 from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.first_estimates import estimate_pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
-from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.mapping.keyframe_insertion import (
     insert_keyframe,
@@ -62,9 +62,8 @@ from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
 from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose, is_high_loss
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, is_high_loss
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import (
     TRAJECTORY_LENGTH,
@@ -73,7 +72,6 @@ from tracking3d.estimation.online.tracking.motion_model import (
     pose_predictions,
     predict_points,
 )
-from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, pose_evidence
 from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
 from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.shape import Shape
@@ -256,27 +254,9 @@ class OnlineSolver(ContinuedRefinement):
             updated = replace(
                 state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
             )
-        poses = {view.index: view.pose for view in object_map.keyframes}
-        pose, usual, revised, trail = object_map.keyframes[0].pose, updated.baseline, [], []
-        for seen, earlier in waiting:
-            view = with_focal_length(seen, before, camera)
-            start_pose = poses.get(view.index, pose)
-            if object_map.pointless:
-                view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
-            fit = self._fit(updated, view, {start.origin: start_pose}, view.points)[1]
-            if view.index == object_map.keyframes[0].index:
-                fit = replace(fit, pose=start_pose)
-            pose, usual = fit.pose, usual.update(fit)
-            trail.append((pose, view.index))
-            kept = find_inliers(object_map, camera, pose, view.points, view)
-            support = pose_evidence(object_map, camera, pose, kept, view)
-            found = PoseCandidate(view, fit, start.origin, kept, support, assess_pose(fit, usual, support))
-            revised.append(make_estimate(updated, earlier, found))
-            updated = learn_colours(updated, revised[-1], found)
-        updated = replace(
-            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]),
-            baseline=usual, tracked_points=view.points,
-        )  # fmt: skip
+            updated, revised = estimate_pending_frames(
+                updated, waiting, start, before, self.online, self.weights
+            )
         estimate = replace(revised[-1], revised=tuple(revised[:-1]))
         if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
             estimate = replace(estimate, reason=_LOOKS_FLAT)

@@ -1,0 +1,88 @@
+"""The estimates of the frames that waited for the first map, with that map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.initialization.initial_map import InitialMap
+from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, refine_local_map
+from tracking3d.estimation.online.masks.frame_estimates import learn_colours, make_estimate
+from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose
+from tracking3d.estimation.online.state.object_map import Keyframe
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
+from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, fit_pose, pose_evidence
+from tracking3d.geometry.camera import Camera
+
+
+def estimate_pending_frames(
+    state: SolverState,
+    waiting: tuple[tuple[Keyframe, FrameEstimate], ...],
+    start: InitialMap,
+    before: Camera,
+    config: OnlineConfig,
+    weights: PoseWeights,
+) -> tuple[SolverState, list[FrameEstimate]]:
+    """Estimate all pending frames with the first map, one after the other.
+
+    The map may have been made from the first of them only. Those after these that show something new become keyframes,
+    so that their points are landmarks by the time that the last frame is reached.
+
+    Args:
+        state: The state with the first map, as it was refined.
+        waiting: The pending frames, and the estimates that they had.
+        start: The first map, as it was found.
+        before: The camera that the frames waited with.
+        config: The solver's options.
+        weights: Weights of a pose's cost terms.
+    """
+    poses = {view.index: view.pose for view in state.object_map.keyframes}
+    first = state.object_map.keyframes[0]
+    last = max(poses)
+    pose, usual, revised, trail = first.pose, state.baseline, list[FrameEstimate](), []
+    for seen, earlier in waiting:
+        view = with_focal_length(seen, before, state.camera)
+        if state.object_map.pointless:
+            view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
+        assert state.surface is not None
+        starts = {start.origin: poses.get(view.index, pose)}
+        fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
+        if view.index == first.index:
+            fit = replace(fit, pose=starts[start.origin])
+        kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
+        evidence = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
+        found = PoseCandidate(view, fit, start.origin, kept, evidence, assess_pose(fit, usual, evidence))
+        if view.index > last and _is_new(state, found, config):
+            state = _with_keyframe(state, found, config)
+            found = replace(found, fit=replace(fit, pose=state.object_map.keyframes[-1].pose))
+        pose, usual = found.fit.pose, usual.update(found.fit)
+        trail.append((pose, view.index))
+        revised.append(make_estimate(state, earlier, found))
+        state = learn_colours(state, revised[-1], found)
+    return replace(
+        state, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]),
+        baseline=usual, tracked_points=view.points,
+    ), revised  # fmt: skip
+
+
+def _is_new(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> bool:
+    """Whether a pending frame is to be a keyframe; without points its pose is no better than the outline."""
+    points = found.evidence.inliers >= ENOUGH_POINTS and not state.object_map.pointless
+    return points and not found.lost and needs_keyframe(state.object_map, found, config)
+
+
+def _with_keyframe(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> SolverState:
+    """The map with a pending frame as one more keyframe; the points that were tracked into it become landmarks."""
+    view = replace(found.view, pose=found.fit.pose, points=found.points)
+    object_map = replace(state.object_map, keyframes=(*state.object_map.keyframes, view))
+    everything = list(range(len(object_map.keyframes)))
+    object_map = refine_local_map(
+        object_map, state.camera, everything, config, bundle_iterations=10, rounds=1
+    )
+    return replace(state, object_map=object_map, surface=object_map.surface())
