@@ -53,9 +53,9 @@ def test_paint_and_erase_start_from_the_mask_of_the_run(page, begun):
     assert np.array_equal(mask, colours_of(page, drawn))
 
 
-@pytest.mark.parametrize("anew", [BOX, POINTS], ids=["box", "points"])
-def test_a_box_or_points_replace_the_mask_of_the_run(page, begun, anew):
-    assert status(post(page, "/correct", {**anew, "frame": 3, "strokes": [PAINT]})) == 200
+@pytest.mark.parametrize("given", [BOX, POINTS], ids=["box", "points"])
+def test_a_box_or_points_replace_the_mask_of_the_run(page, begun, given):
+    assert status(post(page, "/correct", {**given, "frame": 3, "strokes": [PAINT]})) == 200
     assert begun[0].mask[22:42, 33:46].mean() > 0.9
 
 

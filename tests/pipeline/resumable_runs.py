@@ -21,7 +21,9 @@ class Stopped(KeyboardInterrupt):
 
 
 def settings(*overrides: str):
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
+    """Of runs that take no time, by masks of a tracker unless others are given."""
+    precomputed = any("precomputed" in override for override in overrides)
+    quick = [] if precomputed else ["tracker.name=flow", "tracker.segmentation_size=64"]
     return load_config(
         overrides=[
             *quick,

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
-from resumable_runs import assert_alike, files_of
+from resumable_runs import Stopped, assert_alike, files_of, settings
 
-from tracking3d import load_config
 from tracking3d.checkpoint import folder as checkpoint_folder
 from tracking3d.checkpoint import milestones, staging
 from tracking3d.errors import InputError, OutputError
@@ -24,39 +23,18 @@ from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
-from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import visible_side
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FRAMES, CORRECTED = 8, 6
 
 
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C at a chosen moment."""
-
-
-@pytest.fixture(scope="module")
-def clip() -> SyntheticClip:
-    return synthesize(SyntheticSpec(frames=FRAMES, size=(80, 64), supersample=1, degrees_per_frame=4))
-
-
-@pytest.fixture(scope="module")
-def images(clip, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("clip")
-    for index, image in enumerate(clip.images):
-        write_image(folder / f"{index:03d}.png", image)
-    return folder
-
-
 @pytest.fixture(autouse=True)
-def every_frame(monkeypatch):
+def every_frame(monkeypatch, stand_in_solver):
     """Milestones of every frame, and a solver that answers at once."""
     monkeypatch.setattr(milestones, "_FIRST_GAP", 1)
-    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
-    monkeypatch.setattr(CausalSolver, "faults", {})
 
 
 @pytest.fixture
@@ -72,21 +50,8 @@ def stepped(monkeypatch) -> list[int]:
     return frames
 
 
-def settings(*overrides: str):
-    quick = [
-        "tracker.name=flow",
-        "tracker.segmentation_size=64",
-        "crop.size=32",
-        "object.frequency=2",
-        "camera.fov=45",
-    ]
-    return load_config(
-        overrides=[*quick, "object.texture_size=32", *overrides], runtime={"on_plugin_failure": "stop"}
-    )
-
-
 def run(clip, images, folder: Path, *overrides: str, **given) -> Path:
-    """Without evidence, which is weighed anew whatever is corrected."""
+    """Without evidence, which is weighed again whatever is corrected."""
     given.setdefault("mask", clip.masks[given.get("start_frame") or 0])
     record(open_source(str(images)), settings("object.refine_masks=false", *overrides), folder, **given)
     return folder

@@ -12,7 +12,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from refining_solver import CausalSolver, StandInSolver
+from refining_solver import StandInSolver
 from resumable_runs import Stopped, assert_alike, settings, stop_at
 
 from tracking3d.errors import InputError
@@ -23,7 +23,6 @@ from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FRAMES = 7
@@ -40,25 +39,9 @@ class SteadySolver(StandInSolver):
         return state, replace(estimate, T_cam_obj=T)
 
 
-@pytest.fixture(scope="module")
-def clip():
-    return synthesize(SyntheticSpec(frames=FRAMES, size=(80, 64), supersample=1, degrees_per_frame=4))
-
-
-@pytest.fixture(scope="module")
-def images(clip, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("clip")
-    for index, image in enumerate(clip.images):
-        write_image(folder / f"{index:03d}.png", image)
-    return folder
-
-
 @pytest.fixture(autouse=True)
-def solvers(monkeypatch):
+def steady_solver(monkeypatch, stand_in_solver):
     monkeypatch.setitem(SOLVERS, "online", SteadySolver)
-    monkeypatch.setattr(CausalSolver, "faults", {})
-    monkeypatch.setattr(StandInSolver, "revisit_faults", {})
-    monkeypatch.setattr(StandInSolver, "seen", [])
 
 
 @pytest.fixture(scope="module")

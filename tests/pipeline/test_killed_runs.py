@@ -21,7 +21,6 @@ from resumable_runs import assert_alike, finished_frames
 from tracking3d import load_config
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.results.files import write_image
 from tracking3d.results.layout import CAUSAL, has_state
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -47,14 +46,6 @@ QUICK = [
 @pytest.fixture(scope="module")
 def clip() -> SyntheticClip:
     return synthesize(SyntheticSpec(frames=FRAMES, size=SIZE, supersample=1, degrees_per_frame=5))
-
-
-@pytest.fixture(scope="module")
-def images(clip, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("clip")
-    for index, image in enumerate(clip.images):
-        write_image(folder / f"{index:03d}.png", image)
-    return folder
 
 
 def track(images: Path, folder: Path, mask, log: Path, quick: bool) -> None:

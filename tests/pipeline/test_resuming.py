@@ -27,36 +27,15 @@ from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
 from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.trackers.flow import FlowTracker
 from tracking3d.video import open_source
 
+pytestmark = pytest.mark.usefixtures("stand_in_solver")
 FRAMES = 6
 
 
-@pytest.fixture(scope="module")
-def clip() -> SyntheticClip:
-    return synthesize(SyntheticSpec(frames=FRAMES, size=(80, 64), supersample=1, degrees_per_frame=4))
-
-
-@pytest.fixture(scope="module")
-def images(clip, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("clip")
-    for index, image in enumerate(clip.images):
-        write_image(folder / f"{index:03d}.png", image)
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def solvers(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
-    monkeypatch.setattr(CausalSolver, "faults", {})
-    monkeypatch.setattr(StandInSolver, "revisit_faults", {})
-    monkeypatch.setattr(StandInSolver, "seen", [])
-
-
 @pytest.fixture
-def online(monkeypatch) -> None:
+def online(monkeypatch, stand_in_solver) -> None:
     """The solver itself."""
     monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
 

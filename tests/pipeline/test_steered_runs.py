@@ -7,11 +7,10 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from refining_solver import CausalSolver, StandInSolver
-from resumable_runs import assert_alike
+from refining_solver import StandInSolver
+from resumable_runs import Stopped, assert_alike, settings
 
 import tracking3d
-from tracking3d import load_config
 from tracking3d.checkpoint.folder import finish_state
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.solver import OnlineSolver
@@ -22,63 +21,22 @@ from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.corrections import Correction
 from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results import layout
-from tracking3d.results.files import write_image, write_mask
+from tracking3d.results.files import write_mask
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import both_ways as both_ways_module
 from tracking3d.video import open_source
 from tracking3d.video.both_ways import both_ways
 
+pytestmark = pytest.mark.usefixtures("stand_in_solver")
 FRAMES, START = 7, 3
 
 
-@pytest.fixture(autouse=True)
-def solvers(monkeypatch) -> None:
-    """The solver answers at once."""
-    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
-    monkeypatch.setattr(CausalSolver, "faults", {})
-    monkeypatch.setattr(StandInSolver, "revisit_faults", {})
-    monkeypatch.setattr(StandInSolver, "seen", [])
-
-
 @pytest.fixture
-def online(monkeypatch, solvers) -> None:
+def online(monkeypatch, stand_in_solver) -> None:
     """The solver itself."""
     monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
-
-
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C at a chosen moment."""
-
-
-@pytest.fixture(scope="module")
-def clip() -> SyntheticClip:
-    return synthesize(SyntheticSpec(frames=FRAMES, size=(80, 64), supersample=1, degrees_per_frame=4))
-
-
-@pytest.fixture(scope="module")
-def images(clip, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("clip")
-    for index, image in enumerate(clip.images):
-        write_image(folder / f"{index:03d}.png", image)
-    return folder
-
-
-def settings(*overrides: str):
-    precomputed = any("precomputed" in override for override in overrides)
-    quick = [] if precomputed else ["tracker.name=flow", "tracker.segmentation_size=64"]
-    return load_config(
-        overrides=[
-            *quick,
-            "crop.size=32",
-            "object.frequency=2",
-            "object.texture_size=32",
-            "camera.fov=45",
-            *overrides,
-        ],
-        runtime={"on_plugin_failure": "stop"},
-    )
 
 
 CAUSAL = "solver.final_refine=false"

@@ -56,7 +56,7 @@ def corners_of(box: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def frustum_size(radius: float, distance: float) -> float:
-    """The size of a keyframe's frustum: small beside the object.
+    """The size of a keyframe's frustum: small compared with the object.
 
     Args:
         radius: Of the object.
