@@ -7,7 +7,6 @@ import os
 import re
 import select
 import sys
-import time
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -22,8 +21,9 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-termin
 
 QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "tracker.segmentation_size=64"]
 FRAMES = 8
-LONGEST_SILENCE = 20.0
-"""Seconds; the line moves ten times a second, but a loaded machine may stop it."""
+LONGEST_SILENCE = 2.0
+"""Seconds, counted in looks at the terminal: a machine that stops both programs for a while adds none."""
+_LOOK = 0.1
 _CONTROL = re.compile(rb"\x1b\[[0-9;?]*[A-Za-z]|\r")
 _STAGE = re.compile(r"[^\w\n]((?:tracking|refining|texture|report|turntable)(?: [a-z]+)*)(?: (\d+)/(\d+))?")
 
@@ -45,14 +45,13 @@ class Watched:
 
 def watch(terminal: int, process: BaseProcess) -> Watched:
     """Read what a process writes into a terminal until it ends."""
-    shown, last, longest, words = b"", time.monotonic(), 0.0, b""
+    shown, silence, longest, words = b"", 0.0, 0.0, b""
     process.start()
     while process.is_alive():
-        ready, _, _ = select.select([terminal], [], [], 0.2)
+        ready, _, _ = select.select([terminal], [], [], _LOOK)
         if ready:
-            shown += os.read(terminal, 65536)
-            last = time.monotonic()
-        elif (silence := time.monotonic() - last) > longest:
+            shown, silence = shown + os.read(terminal, 65536), 0.0
+        elif (silence := silence + _LOOK) > longest:
             longest, words = silence, shown[-200:]
     process.join()
     text, words = (_CONTROL.sub(b"", part) for part in (shown, words))

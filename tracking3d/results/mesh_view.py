@@ -88,7 +88,7 @@ def render_view(
         model: The object.
         rotation: ``(3, 3)`` object to camera.
         size: Side in pixels.
-        texture: See `texture_of_views`, for whoever draws several.
+        texture: See `texture_of_views`; made here if left out. Several views of one object share it.
     """
     texture = texture_of_views(model, size) if texture is None else texture
     low, high = model.vertices.min(0), model.vertices.max(0)
