@@ -6,7 +6,9 @@ Conventions: OpenCV camera axes (x right, y down, z forward); pixel (0, 0) is th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tracking3d.runtime.deferred_import import import_on_use
 
 __version__ = "0.1.0"
 
@@ -59,10 +61,5 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    """Import the public names on first use, so that `tracking3d --help` need not wait for torch."""
-    if name not in _HOME:
-        raise AttributeError(f"module 'tracking3d' has no attribute '{name}'")
-    from importlib import import_module
-
-    return getattr(import_module(_HOME[name]), name)
+# `tracking3d --help` need not wait for torch.
+__getattr__ = import_on_use(__name__, _HOME)

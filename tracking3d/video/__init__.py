@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tracking3d.runtime.deferred_import import import_on_use
 
 if TYPE_CHECKING:
     from tracking3d.video.image_file import read_image
@@ -24,21 +26,16 @@ __all__ = [
 ]
 
 _HOME = {
-    "FrameSource": "source",
-    "Intrinsics": "source",
-    "LatestFrames": "latest_frames",
-    "VideoWriter": "writer",
-    "natural_order": "selection",
-    "open_source": "opening",
-    "parse_selection": "selection",
-    "read_image": "image_file",
+    "FrameSource": "tracking3d.video.source",
+    "Intrinsics": "tracking3d.video.source",
+    "LatestFrames": "tracking3d.video.latest_frames",
+    "VideoWriter": "tracking3d.video.writer",
+    "natural_order": "tracking3d.video.selection",
+    "open_source": "tracking3d.video.opening",
+    "parse_selection": "tracking3d.video.selection",
+    "read_image": "tracking3d.video.image_file",
 }
 
 
-def __getattr__(name: str) -> Any:
-    """Import the public names on first use: whoever reads ``--frames`` need not wait for OpenCV and FFmpeg."""
-    if name not in _HOME:
-        raise AttributeError(f"module 'tracking3d.video' has no attribute '{name}'")
-    from importlib import import_module
-
-    return getattr(import_module(f"tracking3d.video.{_HOME[name]}"), name)
+# Whoever reads ``--frames`` need not wait for OpenCV and FFmpeg.
+__getattr__ = import_on_use(__name__, _HOME)
