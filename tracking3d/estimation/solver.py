@@ -6,6 +6,7 @@ data: a frame that cannot be estimated is answered with a status and a reason, n
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
+from tracking3d.estimation.gap import Explained, Gap
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.shape import Shape
@@ -89,6 +91,40 @@ class ContinuingSolver(Protocol, Generic[State]):
 
     def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
         """Take a frame whose refined pose ``(4, 4)`` stands, before ``refine_frame`` takes the next one."""
+        ...
+
+
+@runtime_checkable
+class ExtendingSolver(Protocol, Generic[State]):
+    """A refining solver that can track the object into frames that were not explained, before it refines everything."""
+
+    def begin_extension(
+        self, state: State, confidence: Mapping[int, float]
+    ) -> tuple[State, Explained] | None:
+        """The state for ``extend``, and what the model explains; None if there is nothing to start from.
+
+        Args:
+            state: After the last frame.
+            confidence: Of the causal estimate of each frame, by index, with the model that it was made with.
+        """
+        ...
+
+    def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
+        """Track the object through a gap, and learn from it; the gap's anchor is one of ``Explained.anchors``."""
+        ...
+
+    def end_extension(self, state: State, found: Collection[int], last: int) -> State:
+        """The state for ``refine``.
+
+        Args:
+            state: After the last gap.
+            found: Indices of the frames of gaps in which the object was found.
+            last: Index of the last frame of the video.
+        """
+        ...
+
+    def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
+        """The state that refines frames from other poses ``(4, 4)`` than the causal ones, by frame index."""
         ...
 
 

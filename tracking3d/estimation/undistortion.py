@@ -6,6 +6,7 @@ and the solver's own state are of the pinhole camera.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Generic
 
@@ -13,8 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
+from tracking3d.estimation.gap import Explained, Gap
 from tracking3d.estimation.refined_start import RefinedStart
-from tracking3d.estimation.solver import ContinuingSolver, GuidedSolver, RefiningSolver, Solver, State
+from tracking3d.estimation.solver import (
+    ContinuingSolver,
+    ExtendingSolver,
+    GuidedSolver,
+    RefiningSolver,
+    Solver,
+    State,
+)
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.lens import Lens
 
@@ -102,6 +111,34 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         """See `ContinuingSolver.keep_frame`."""
         kept: State = self._solver.keep_frame(state, self._frame(frame), T_cam_obj)
         return kept
+
+    def begin_extension(
+        self, state: State, confidence: Mapping[int, float]
+    ) -> tuple[State, Explained] | None:
+        """See `ExtendingSolver.begin_extension`."""
+        if not isinstance(self._solver, ExtendingSolver):
+            return None
+        begun: tuple[State, Explained] | None = self._solver.begin_extension(state, confidence)
+        return begun
+
+    def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
+        """See `ExtendingSolver.extend`; the estimates' masks are those of the pinhole camera."""
+        frames = ((self._frame(frame), self._mask(mask)) for frame, mask in gap.frames)
+        extended: tuple[State, list[FrameEstimate]] = self._solver.extend(
+            state, replace(gap, anchor=self._frame(gap.anchor), frames=frames)
+        )
+        return extended
+
+    def end_extension(self, state: State, found: Collection[int], last: int) -> State:
+        """See `ExtendingSolver.end_extension`."""
+        ended: State = self._solver.end_extension(state, found, last)
+        return ended
+
+    def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
+        """See `ExtendingSolver.start_from`; poses are those of the pinhole camera in any case."""
+        return (
+            state if not isinstance(self._solver, ExtendingSolver) else self._solver.start_from(state, poses)
+        )
 
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]

@@ -23,11 +23,15 @@ class FrameOrder:
     first: int
     last: int | None = None
 
+    def number_of(self, index: int) -> int:
+        """The number of the frame with an index."""
+        if self.last is None or index >= self.first:
+            return index
+        return self.last + self.first - index
+
     def number(self, frame: Frame) -> Frame:
         """The frame as the solver is shown it."""
-        if self.last is None or frame.index >= self.first:
-            return frame
-        return replace(frame, index=self.last + self.first - frame.index)
+        return replace(frame, index=self.number_of(frame.index))
 
     def index(self, estimate: FrameEstimate) -> FrameEstimate:
         """The solver's estimate, and those that it revises, under their frames' own indices."""

@@ -16,8 +16,10 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.pipeline.earlier_refinement import EarlierRefinement, find_earlier_refinement
 from tracking3d.pipeline.final_refinement import FinalRefinement
+from tracking3d.pipeline.lost_frames import explain_lost_frames
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
+from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture
@@ -237,6 +239,8 @@ class ObjectRecorder:
         estimates = self._writer.begin_refinement(self._causal_model)
         if self._continue_earlier(estimates):
             return estimates
+        explain_lost_frames(self._session, source, SavedMasks(estimates, self._initial))
+        report_progress("refining the map")
         self._session.refine()
         self._state.save(
             self._session.state_dict(),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,15 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed
+from tracking3d.estimation.gap import Explained, Gap
 from tracking3d.estimation.refined_start import RefinedStart
-from tracking3d.estimation.solver import ContinuingSolver, RefiningSolver, Solver
+from tracking3d.estimation.solver import (
+    ContinuingSolver,
+    ExtendingSolver,
+    GuidedSolver,
+    RefiningSolver,
+    Solver,
+)
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.components import add_times
@@ -19,6 +27,23 @@ from tracking3d.pipeline.frame_order import FrameOrder
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.runtime.isolation import IsolatedRuntime
 from tracking3d.runtime.stage_times import StageTimes, measure
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What another start comes to.
+
+    Attributes:
+        state: The solver's state after the last frame.
+        order: The order in which the solver was shown the frames.
+        poses: The pose ``(4, 4)`` in each frame, by index.
+        confidence: Of these poses.
+    """
+
+    state: Any
+    order: FrameOrder
+    poses: Mapping[int, NDArray[np.float64]]
+    confidence: Mapping[int, float]
 
 
 class SessionRefinement:
@@ -50,9 +75,92 @@ class SessionRefinement:
         """
         with self._settings.in_force(), measure("map") as watch:
             self._state = self._refining().refine(self._state)
-        self.refining = watch.times
+        self.refining += watch.times
         self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
+
+    def begin_extension(self, confidence: Mapping[int, float]) -> Explained | None:
+        """Prepare to track the object into frames that are not explained; None if the solver cannot.
+
+        Args:
+            confidence: Of the causal estimate of each frame, by index.
+        """
+        solver = self._solver
+        if not isinstance(solver, ExtendingSolver) or not self.order_of_time:
+            return None
+        with self._settings.in_force():
+            begun = solver.begin_extension(self._state, confidence)
+        if begun is None:
+            return None
+        self._state, explained = begun
+        return explained
+
+    def extend(self, gap: Gap) -> list[FrameEstimate]:
+        """Track the object through a gap, before `refine`; no estimates if a plug-in fails."""
+        assert isinstance(self._solver, ExtendingSolver)
+        try:
+            with self._settings.in_force(), measure("map") as watch:
+                self._state, estimates = self._solver.extend(self._state, gap)
+        except PluginFailure:
+            return []
+        self.refining += watch.times
+        return estimates
+
+    def end_extension(self, poses: Mapping[int, NDArray[np.float64]], last: int) -> None:
+        """Refine the frames of gaps from these poses ``(4, 4)``, by index; ``last`` is the last frame of the video."""
+        assert isinstance(self._solver, ExtendingSolver)
+        self._state = self._solver.end_extension(self._state, set(poses), last)
+        self._state = self._solver.start_from(self._state, poses)
+
+    @property
+    def order_of_time(self) -> bool:
+        """Whether all frames were shown to the solver in order of time."""
+        return self._presented.last is None
+
+    def attempt(self, frames: Iterable[tuple[Frame, MaskEstimate]]) -> Attempt | None:
+        """Track the object once more from another frame, with given masks.
+
+        Args:
+            frames: Frames with their initial masks: from the start to the end of the video, then those before it
+                backwards.
+
+        Returns:
+            What it comes to; None if the solver cannot, or a plug-in fails.
+        """
+        solver, state, first, found = self._solver, None, None, dict[int, FrameEstimate]()
+        if not isinstance(solver, GuidedSolver):
+            return None
+        order, latest = FrameOrder(0), 0
+        try:
+            with self._settings.in_force(), measure("map") as watch:
+                for frame, mask in frames:
+                    if first is None:
+                        first, order = frame, FrameOrder(frame.index)
+                        state, estimate = solver.init(frame, mask)
+                    else:
+                        if frame.index < first.index and order.last is None:
+                            order = FrameOrder(first.index, latest)
+                            T_cam_obj = found[first.index].T_cam_obj
+                            state = solver.restart_backwards(state, first, latest, T_cam_obj)
+                        state, estimate = solver.step(state, order.number(frame), mask)
+                        estimate = order.index(estimate)
+                    latest = max(latest, frame.index)
+                    found |= {one.index: _without_masks(one) for one in (*estimate.revised, estimate)}
+        except PluginFailure:
+            return None
+        self.refining += watch.times
+        poses = {index: np.asarray(one.T_cam_obj, np.float64) for index, one in found.items()}
+        confidence = {index: one.confidence for index, one in found.items()}
+        return Attempt(state, order, poses, confidence)
+
+    def adopt(self, attempt: Attempt) -> None:
+        """Continue with another start in place of the first one."""
+        self._state, order = attempt.state, attempt.order
+        if isinstance(self._solver, ExtendingSolver):
+            poses = {order.number_of(index): T for index, T in attempt.poses.items()}
+            self._state = self._solver.start_from(self._state, poses)
+        self._presented = order
+        self._camera = getattr(self._state, "camera", self._camera)
 
     def continue_refinement(self, start: RefinedStart) -> bool:
         """Start from an earlier refinement, in place of `refine`: only the frames that have changed are refined.
@@ -110,3 +218,9 @@ class SessionRefinement:
         if not isinstance(self._solver, RefiningSolver):
             raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")
         return self._solver
+
+
+def _without_masks(estimate: FrameEstimate) -> FrameEstimate:
+    """An estimate without what takes much memory."""
+    nothing = np.zeros((0, 0), bool)
+    return replace(estimate, mask=nothing, initial_mask=None, probability=None, revised=())

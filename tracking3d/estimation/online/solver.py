@@ -37,6 +37,7 @@ from tracking3d.estimation.online.atlas.atlas import (
     refine_inactive_map,
     switch_map,
     transform_estimates,
+    with_lens_of,
 )
 from tracking3d.estimation.online.atlas.map_alignment import merge_maps
 from tracking3d.estimation.online.atlas.reinitialization import (
@@ -45,32 +46,23 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     is_reliable,
     masks_overlap,
 )
-from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.first_estimates import estimate_pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
-from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
+from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
-from tracking3d.estimation.online.mapping.keyframe_insertion import (
-    insert_keyframe,
-    insert_points,
-    needs_keyframe,
-    refine_local_map,
-)
+from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points, refine_local_map
 from tracking3d.estimation.online.mapping.object_model import object_model
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
-from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, is_high_loss
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import (
     TRAJECTORY_LENGTH,
     advance,
-    extrapolate_motion,
     pose_predictions,
-    predict_points,
 )
 from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
 from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
@@ -88,7 +80,7 @@ _LOOKS_FLAT = (
 
 
 @dataclass(frozen=True)
-class OnlineSolver(ContinuedRefinement):
+class OnlineSolver(MapExtension):
     """The solver `online`; implements all protocols of `tracking3d.estimation.solver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
@@ -187,6 +179,7 @@ class OnlineSolver(ContinuedRefinement):
         """Estimate a frame's pose again, with the final map."""
         state = map_of_frame(state, frame.index)
         binary, image, object_map = mask.found, grey(frame.image), state.object_map
+        T_cam_obj = state.extended.get(frame.index, T_cam_obj)
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
         if state.surface is None:
             return state, replace(initial_estimate(frame, binary, causal, state.camera), refined=True)
@@ -262,49 +255,6 @@ class OnlineSolver(ContinuedRefinement):
             estimate = replace(estimate, reason=_LOOKS_FLAT)
         return updated, estimate
 
-    def _track(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> tuple[SolverState, FrameEstimate]:
-        """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
-        starts = pose_predictions(state, frame.index, mask)
-        likeliest = next(iter(starts.values()))
-        followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
-        found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
-        usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
-        reliable = usual or found.evidence.is_decisive
-        is_keyframe = not found.lost and reliable and needs_keyframe(state.object_map, found, self.online)
-        pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
-        updated = advance(state, found, pose, image)
-        if usual and not found.lost:
-            updated = replace(updated, baseline=state.baseline.update(found.fit))
-        if is_keyframe:
-            view = replace(found.view, pose=pose, points=found.points)
-            with in_stage("map"):
-                object_map, followed = insert_keyframe(
-                    state.object_map, state.camera, view, image, self.online
-                )
-                surface = object_map.surface()
-                last = object_map.keyframes[-1].pose, frame.index
-                updated = replace(
-                    updated, object_map=object_map, surface=surface, last_pose=last, tracked_points=followed
-                )
-                updated = fix_depth_reversal(updated, self.online)
-                updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
-            pose = updated.last_pose[0]
-        if found.lost:
-            updated = replace(updated, previous_pose=None)
-        elif usual:
-            updated = replace(
-                updated, trajectory=(*updated.trajectory, (pose, frame.index))[-TRAJECTORY_LENGTH:]
-            )
-        found = replace(found, fit=replace(found.fit, pose=pose))
-        plain, now = initial_estimate(frame, mask, pose, state.camera), updated
-        estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
-        updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
-        if not found.lost:
-            updated = replace(updated, reinitialization=None)
-        return updated, replace(estimate, keyframe=is_keyframe)
-
     def _recover(
         self, state: SolverState, estimate: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
     ) -> tuple[SolverState, FrameEstimate]:
@@ -327,14 +277,13 @@ class OnlineSolver(ContinuedRefinement):
         if begun is None or not masks_overlap(last, mask):
             if not is_fully_visible(mask) or not colours_match(state, frame, mask):
                 return replace(state, reinitialization=None), estimate
-            camera = replace(state.camera, assumed=False)
-            return replace(
-                state, reinitialization=self._first_state(frame, mask, camera, state.feature_space)[0]
-            ), estimate
+            second = self._first_state(frame, mask, state.camera, state.feature_space)[0]
+            return replace(state, reinitialization=second), estimate
         begun, again = self._add_pending(begun, frame, image, mask)
         if begun.phase is SolverPhase.INITIALIZING:
             return replace(state, reinitialization=begun), estimate
         if not is_reliable(begun, again):
             return replace(state, reinitialization=None), estimate
+        state = with_lens_of(state, begun)
         similarity = guess_alignment(state, begun)
         return switch_map(state, begun, similarity), transform_estimates(again, similarity, state.camera)

@@ -7,6 +7,7 @@ map that is never merged stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.atlas.map_merging import transform_map, transform_pose
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.focal_length import pose_through_lens, with_focal_length
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
@@ -31,6 +32,24 @@ _UNALIGNED_REASON = (
     "re-initialized after tracking was lost; the pose relative to the earlier map is unknown until a known side is "
     "seen"
 )
+
+
+def with_lens_of(state: SolverState, begun: SolverState) -> SolverState:
+    """The state with a lost map as seen with the focal length that a second initialization found."""
+    before, after = state.camera, begun.camera
+    factor = after.fy / before.fy
+    if factor == 1:
+        return state
+    keyframes = tuple(with_focal_length(view, before, after) for view in state.object_map.keyframes)
+    object_map = replace(state.object_map, keyframes=keyframes)
+    return replace(
+        state,
+        camera=after,
+        object_map=object_map,
+        surface=object_map.surface(),
+        trajectory=tuple((pose_through_lens(pose, factor), index) for pose, index in state.trajectory),
+        inactive_maps=tuple(through_lens(other, before, after) for other in state.inactive_maps),
+    )
 
 
 def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
@@ -127,7 +146,7 @@ def mark_unaligned(estimate: FrameEstimate) -> FrameEstimate:
         status=Status.LOST,
         reason=_UNALIGNED_REASON,
         confidence=min(estimate.confidence, _MAX_UNALIGNED_CONFIDENCE),
-        diagnostics=dict(estimate.diagnostics) | {UNALIGNED_MAP: 1.0},
+        diagnostics=dict(estimate.diagnostics) | {UNALIGNED_MAP: estimate.confidence},
     )
 
 
@@ -149,6 +168,11 @@ def map_of_frame(state: SolverState, index: int) -> SolverState:
         if any(first <= index <= last for first, last in other.spans):
             return _with_active_map(state, other, state.spans)
     return state
+
+
+def frames_of_map(state: SolverState, frames: Iterable[int]) -> Iterator[int]:
+    """Those of some frames that were estimated with the active map."""
+    return (index for index in frames if any(first <= index <= last for first, last in state.spans))
 
 
 def activate_largest_map(state: SolverState) -> SolverState:
@@ -173,12 +197,17 @@ def refine_inactive_map(
 
     Its transform to the map that the mesh is made from is a guess, whichever of the two was first.
     """
-    keyframes = other.object_map.keyframes
-    if after != before:
-        keyframes = tuple(with_focal_length(view, before, after) for view in keyframes)
-    object_map = replace(other.object_map, keyframes=keyframes)
-    object_map, _ = refine_globally(object_map, replace(after, assumed=False), config)
+    other = through_lens(other, before, after)
+    object_map, _ = refine_globally(other.object_map, replace(after, assumed=False), config)
     return replace(other, object_map=object_map, surface=object_map.surface(), unaligned=True)
+
+
+def through_lens(other: InactiveMap, before: Camera, after: Camera) -> InactiveMap:
+    """An inactive map as seen with another focal length."""
+    if after == before:
+        return other
+    keyframes = tuple(with_focal_length(view, before, after) for view in other.object_map.keyframes)
+    return replace(other, object_map=replace(other.object_map, keyframes=keyframes))
 
 
 def _with_active_map(

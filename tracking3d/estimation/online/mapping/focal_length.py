@@ -47,9 +47,14 @@ def with_focal_length(view: Keyframe, before: Camera, after: Camera) -> Keyframe
     factor = after.fy / before.fy
     K = view.observation.K.clone()
     K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
-    x, y, z = view.pose.translation.unbind(-1)
-    pose = Pose(torch.stack([x, y, factor * z], -1), view.pose.quaternion)
+    pose = pose_through_lens(view.pose, factor)
     return replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None)
+
+
+def pose_through_lens(pose: Pose, factor: float) -> Pose:
+    """A pose as seen with a focal length ``factor`` times as long: the image stays, the depth scales."""
+    x, y, z = pose.translation.unbind(-1)
+    return Pose(torch.stack([x, y, factor * z], -1), pose.quaternion)
 
 
 def lens_change(factor: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 
@@ -84,6 +85,8 @@ class SolverState:
         unaligned: Whether the transform from the active map to the first one is only a guess.
         reversal_attempt: How many keyframes there were, and how many degrees they spanned, when a depth reversal was
             last tried.
+        extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
+            explain, by frame index.
     """
 
     camera: Camera
@@ -112,6 +115,7 @@ class SolverState:
     active_since: int = -1
     unaligned: bool = False
     reversal_attempt: tuple[int, float] = (0, 0.0)
+    extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def phase(self) -> SolverPhase:

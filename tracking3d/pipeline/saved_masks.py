@@ -1,0 +1,38 @@
+"""The initial masks of a video that was tracked, for passes that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.results.refined_estimates import RefinedEstimates
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMasks:
+    """What the mask tracker gave for each frame.
+
+    Attributes:
+        estimates: The estimates of the run, in whose folder the masks are.
+        initial: Score and reason of every frame's initial mask, by index.
+    """
+
+    estimates: RefinedEstimates
+    initial: Mapping[int, tuple[float, str]]
+
+    def seen(self, index: int) -> bool:
+        """Whether the mask tracker saw the object in a frame."""
+        return self.estimates.causal[index].iou_initial is not None
+
+    def of(self, frame: Frame) -> MaskEstimate:
+        """The initial mask of a frame."""
+        mask = self.estimates.initial_mask(frame.index)
+        score, reason = self.initial.get(frame.index, (1.0, ""))
+        return MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
+
+    def added(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, MaskEstimate]]:
+        """Frames with their initial masks."""
+        return ((frame, self.of(frame)) for frame in frames)
