@@ -33,7 +33,8 @@ _FINGER, _THUMB, _WRIST, _SLEEVE = 0.1, 0.12, 0.2, 0.27  # radii
 _PALM = (0.42, 0.47, 0.2)
 _WRIST_X, _SLEEVE_X = 0.85, 1.12  # along the arm from the knuckles
 _OPEN = 0.4  # of fingers and thumb while the hand comes and leaves
-_SHORTEST, _LONGEST = 0.3, 1.5  # how far the middle finger reaches over the object
+_SMALLEST, _LARGEST = 0.72, 1.05  # size of a hand in radii of the object
+_SHORTEST, _LONGEST = 0.35, 1.3  # how far the middle finger reaches over the object
 
 _SKINS = np.array([[0.62, 0.34, 0.22], [0.5, 0.25, 0.15], [0.3, 0.14, 0.08], [0.68, 0.42, 0.3]])  # linear light
 _CLOTHS = np.array([[0.05, 0.06, 0.1], [0.3, 0.3, 0.32], [0.25, 0.06, 0.05], [0.07, 0.16, 0.12]])
@@ -173,10 +174,10 @@ def make_grip(
         return None
     rng = spec.random("occluder")
     radius = float(np.linalg.norm(surface.vertices, axis=1).max())
-    size = radius * rng.uniform(0.85, 1.0)
+    size = radius * _SMALLEST
     start = path.T_cam_rest(np.zeros(1))[0]
     base = _side(rng, start[:3, :3])
-    lowest = size * (abs(_ROWS[0]) * abs(base[1, 1]) + _FINGER)
+    lowest = radius * _LARGEST * (abs(_ROWS[0]) * abs(base[1, 1]) + _FINGER)
     height = max(0.0, lowest + surface.vertices[:, 1].min() + 0.05 * radius)
     edge = 0.5 * max(camera.width / camera.fx, camera.height / camera.fy) * start[2, 3]
     hand = GrippingHand(
@@ -197,22 +198,28 @@ def make_grip(
 
 
 def _reaching(hand: GrippingHand, surface: RayMesh, camera: Camera, wanted: float) -> GrippingHand:
-    """The hand whose fingers hide as much as ``wanted`` of the object in the worst frame, or nearly."""
+    """The hand whose fingers hide as much as ``wanted`` of the object in the worst frame, or nearly.
+
+    A larger hand reaches farther; how much the smallest one hides is no matter of choice.
+    """
     plan = hand.handling.schedule
     times = np.linspace(plan.grasp, plan.released, 9).round()
     poses = hand.path.T_cam_obj(times)
     seen = [object_rays(surface, T, camera) for T in poses]
 
-    def worst(overlap: float) -> float:
-        tried = replace(hand, overlap=overlap)
+    def grown(share: float) -> GrippingHand:
+        size = hand.radius * (_SMALLEST + share * (_LARGEST - _SMALLEST))
+        return replace(hand, size=size, overlap=_SHORTEST + share * (_LONGEST - _SHORTEST))
+
+    def worst(tried: GrippingHand) -> float:
         pairs = zip(times.tolist(), seen, strict=True)
         return max(hidden_share(_bent(tried, time), tried.T_cam_hand(time), rays) for time, rays in pairs)
 
-    low, high = _SHORTEST, _LONGEST
-    for _ in range(6):
+    low, high = 0.0, 1.0
+    for _ in range(5):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if worst(middle) < wanted else (low, middle)
-    return replace(hand, overlap=low).touching()
+        low, high = (middle, high) if worst(grown(middle)) < wanted else (low, middle)
+    return grown(low).touching()
 
 
 def _side(rng: np.random.Generator, R_cam_rest: Array) -> Array:

@@ -27,6 +27,7 @@ _COME, _LIFT, _TURN, _LOWER = 0.13, 0.1, 0.5, 0.11
 
 _PAUSES = 0.36  # share of the turning time before, between and after the turns
 _LARGEST_TURN = math.radians(120)
+_OTHER_SIDE = 60  # degrees that the object is turned at the end at least
 _CLEARANCE = 1.2  # height of the object's centre over the table while it turns; its radius is 1
 _FOLLOW, _LARGEST_FOLLOW = 0.45, math.radians(35)  # how far the wrist goes along with a turn
 _SHAKE = 0.006  # of the camera's direction, relative to the vertical field of view
@@ -173,8 +174,8 @@ def _turns(
 
 
 def _upright_again(turned: Rotation, wanted: float) -> Array:
-    """The rotation vector ``(3,)`` of nearly the ``wanted`` angle after which y is up again."""
-    ends = Rotation.from_euler("y", np.arange(0, 360, 5), degrees=True)
+    """The rotation vector ``(3,)`` of nearly the ``wanted`` angle after which y is up again, and another side seen."""
+    ends = Rotation.from_euler("y", np.arange(_OTHER_SIDE, 361 - _OTHER_SIDE, 5)[:, None], degrees=True)
     vectors = (ends * turned.inv()).as_rotvec()
     best: Array = vectors[np.abs(np.linalg.norm(vectors, axis=1) - wanted).argmin()]
     return best

@@ -67,7 +67,7 @@ def look_at(
     else:
         rows, columns = pixels
     directions = ray_directions(scene.camera, columns + offset[0], rows + offset[1])
-    R, t = T[:3, :3], T[:3, 3]
+    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3]  # products with a part of a matrix are slow
     hits = surface.cast(np.tile(-R.T @ t, (len(directions), 1)), directions @ R)
     hit = (hits.face >= 0) & (hits.distance > 0)
     hits = MeshHits(hits.face[hit], hits.distance[hit], hits.weights[hit])

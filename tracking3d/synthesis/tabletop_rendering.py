@@ -2,7 +2,7 @@
 
 Unlike with other motions not all pixels get several rays: the table is seen through homographies, the light on it is
 worked out on a coarse grid, and only pixels on outlines and edges of the object and the hand are cast at more than
-once. Shadows are soft: they are asked for at every other pixel, with several points of the lamp.
+once, and what is seen at a slant. Shadows are soft: they are asked for at a part of the pixels, with several points of the lamp.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.synthesis.lighting import AMBIENT, DIFFUSE, Lamp, shade
-from tracking3d.synthesis.pixel_rays import pixels_around
+from tracking3d.synthesis.pixel_rays import camera_to_pixels, pixels_around
 from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.scene import Scene
 from tracking3d.synthesis.solid_rendering import (
@@ -32,8 +32,12 @@ Array = NDArray[np.float64]
 
 _COARSE = 240  # cells of the grid of light per image height
 _SEARCH = 160  # rays per image height with which the hand is searched
-_SHADOW_RAYS = 5  # points of the lamp for the object and the hand
+_SHADOW_RAYS, _SHADOW_RAYS_BELOW = 4, 7  # points of the lamp for object and hand, and for table and wall
+_SPARSE = 3  # pixels from one to the next at which shadows on object and hand are asked for
 _EDGE = 0.9  # cosine between neighbouring normals below which there is an edge
+_SLANTED = 0.25  # cosine between normal and ray below which one ray a pixel would miss texels
+
+_FAR_OUT = 20_000  # pixels; what is drawn farther out could overflow
 
 _NOTHING, _OBJECT, _HAND = 0, 1, 2
 
@@ -59,9 +63,10 @@ def render_tabletop(
     depths = np.full((2, *light.shape[:2]), np.inf)
     kind = np.full(light.shape[:2], _NOTHING, np.int8)
     normals = np.zeros((*light.shape[:2], 3), np.float32)
+    slanted = np.zeros(light.shape[:2], bool)
     empty = light.copy()
     for k, solid in enumerate(solids):
-        pixels = _pixels_of_hand(scene, solid) if k else None
+        pixels = _pixels_of_hand(scene, solid) if k else _pixels_of_object(scene, solid)
         seen = look_at(scene, solid.surface, solid.T, np.zeros(2), pixels)
         depths[k][seen.pixels] = seen.depth
         nearer = seen.depth <= depths[:, seen.pixels[0], seen.pixels[1]].min(0)
@@ -69,7 +74,9 @@ def render_tabletop(
         colours = _shaded(scene, k, seen, lit, lamp, lamp.position)
         where = seen.pixels[0][nearer], seen.pixels[1][nearer]
         light[where], kind[where], normals[where] = colours[nearer], k + 1, seen.normals[nearer]
-    _smooth_edges(scene, solids, lamp, light, empty, _edges(kind, normals))
+        facing = -np.einsum("ij,ij->i", seen.normals, seen.points) / np.linalg.norm(seen.points, axis=1)
+        slanted[where] = (facing < _SLANTED)[nearer] if k == 0 else False
+    _smooth_edges(scene, solids, lamp, light, empty, _rough_pixels(kind, normals, slanted))
     return light, depths[0], depths[1]
 
 
@@ -79,23 +86,31 @@ def _surroundings(
     """Linear light ``(H, W, 3)`` of table and wall with the shadows of the ``solids`` on them."""
     width, height = scene.camera.width, scene.camera.height
     step = max(1, round(height / _COARSE))
-    columns, rows = np.meshgrid(np.arange(-(-width // step)), np.arange(-(-height // step)))
-    # cv2.resize takes pixel centres of the grid to the middle of their cells.
-    x, y = (step * (index + 0.5) - 0.5 for index in (columns, rows))
-    layers = []
-    for plane in (tabletop.table, tabletop.wall):
-        H = plane.to_pixels(scene.camera.K, T_cam_rest)
-        M = plane.to_picture @ np.linalg.inv(H)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    light = np.zeros((height, width, 3), np.float32)
+    on_table = _table_share(scene, tabletop, T_cam_rest)
+    for plane, share in ((tabletop.table, on_table), (tabletop.wall, 1 - on_table)):
+        seen = np.flatnonzero(share.any(1))
+        if not len(seen):
+            continue
+        top, bottom = int(seen[0]) // step * step, int(seen[-1]) + 1
+        to_plane = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest))
+        lower = np.array([[1.0, 0, 0], [0, 1, top], [0, 0, 1]])
         albedo = cv2.warpPerspective(
-            plane.picture, M, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+            plane.picture,
+            plane.to_picture @ to_plane @ lower,
+            (width, bottom - top),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
         )
-        received = _light_on(scene, plane, T_cam_rest, np.linalg.inv(H), (x, y), solids, lamp)
-        full = cv2.resize(received, (step * columns.shape[1], step * columns.shape[0]))[:height, :width]
-        layers.append(albedo * full[..., None])
-    on_table = _table_share(scene, tabletop, T_cam_rest)[..., None]
-    light: NDArray[np.float32] = layers[1] + on_table * (layers[0] - layers[1])
-    return light * lamp.brightness.astype(np.float32)
+        columns, rows = np.meshgrid(np.arange(-(-width // step)), np.arange(top // step, -(-bottom // step)))
+        # cv2.resize takes pixel centres of the grid to the middle of their cells.
+        x, y = (step * (index + 0.5) - 0.5 for index in (columns, rows))
+        received = _light_on(scene, plane, T_cam_rest, to_plane, (x, y), solids, lamp)
+        full = cv2.resize(received, (step * columns.shape[1], step * columns.shape[0]))
+        factor = full[: bottom - top, :width] * share[top:bottom]
+        light[top:bottom] += albedo * factor[..., None]
+    light *= lamp.brightness.astype(np.float32)
+    return light
 
 
 def _table_share(scene: Scene, tabletop: Tabletop, T_cam_rest: Array) -> NDArray[np.float32]:
@@ -129,9 +144,10 @@ def _light_on(
     towards = lamp.position - points
     cosine = (towards @ normal / np.linalg.norm(towards, axis=1)).clip(0)
     lit = np.ones(len(points))
-    sources = lamp.points(scene.spec.supersample**2)
+    sources = lamp.points(_SHADOW_RAYS_BELOW)
     for solid in solids:
-        near = np.flatnonzero((cosine > 0) & (points[:, 2] > 0) & _may_be_shadowed(plane, T_cam_rest, solid, place, sources))
+        near = (cosine > 0) & (points[:, 2] > 0) & _may_be_shadowed(plane, T_cam_rest, solid, place, sources)
+        near = np.flatnonzero(near)
         lit[near] *= _unblocked(solid, points[near] + LIFT * scene.solid.radius * normal, sources)
     received = (AMBIENT + DIFFUSE * cosine * lit).astype(np.float32)
     return cv2.GaussianBlur(received.reshape(pixels[0].shape), (0, 0), 0.6)
@@ -171,6 +187,18 @@ def _unblocked(solid: _Solid, points: Array, sources: Array) -> Array:
     return share
 
 
+def _pixels_of_object(scene: Scene, solid: _Solid) -> Pixels | None:
+    """Pixels of the convex outline of the object; None if it reaches behind the camera."""
+    corners = camera_to_pixels(scene.camera, solid.surface.vertices @ solid.T[:3, :3].T + solid.T[:3, 3])
+    if np.isnan(corners).any() or np.abs(corners).max() > _FAR_OUT:
+        return None
+    hull = cv2.convexHull(corners.astype(np.float32)).round().astype(np.int32)
+    inside = np.zeros((scene.camera.height, scene.camera.width), np.uint8)
+    cv2.fillConvexPoly(inside, hull, 1)
+    found = np.nonzero(cv2.dilate(inside, np.ones((5, 5), np.uint8)))
+    return found[0], found[1]
+
+
 def _pixels_of_hand(scene: Scene, hand: _Solid) -> Pixels:
     """Pixels around all that a coarse grid of rays meets of a hand, whose arm may reach behind the camera."""
     width, height = scene.camera.width, scene.camera.height
@@ -190,10 +218,12 @@ def _pixels_of_hand(scene: Scene, hand: _Solid) -> Pixels:
 
 
 def _lit_share(scene: Scene, solids: list[_Solid], seen: Sight, lamp: Lamp) -> Array:
-    """How much of the lamp is seen from the points of a sight ``(N,)``; worked out at every other pixel."""
+    """How much of the lamp is seen from the points of a sight ``(N,)``; worked out at a part of the pixels."""
     rows, columns = seen.pixels
+    if not len(rows):
+        return np.ones(0)
     lift = LIFT * scene.solid.radius
-    some = np.flatnonzero((rows % 2 == 0) & (columns % 2 == 0))
+    some = np.flatnonzero((rows % _SPARSE == 0) & (columns % _SPARSE == 0))
     if not len(some):
         some = np.arange(len(rows))
     part = seen.part(some)
@@ -204,22 +234,23 @@ def _lit_share(scene: Scene, solids: list[_Solid], seen: Sight, lamp: Lamp) -> A
         for solid in solids:
             hidden |= in_shadow(solid.surface, solid.T, part, source, lift)
         shadowed += hidden / len(sources)
-    top, left = rows.min() // 2, columns.min() // 2
-    shape = (rows.max() // 2 - top + 1, columns.max() // 2 - left + 1)
+    top, left = rows.min() // _SPARSE, columns.min() // _SPARSE
+    shape = (rows.max() // _SPARSE - top + 1, columns.max() // _SPARSE - left + 1)
     known, lit = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    here = rows[some] // 2 - top, columns[some] // 2 - left
+    here = rows[some] // _SPARSE - top, columns[some] // _SPARSE - left
     known[here], lit[here] = 1, 1 - shadowed
-    known, lit = (cv2.GaussianBlur(grid, (0, 0), 0.8) for grid in (known, lit))
-    x = (0.5 * columns - left).astype(np.float32)[:, None]
-    y = (0.5 * rows - top).astype(np.float32)[:, None]
+    known, lit = (cv2.GaussianBlur(grid, (0, 0), 0.7) for grid in (known, lit))
+    x = (columns / _SPARSE - left).astype(np.float32)
+    y = (rows / _SPARSE - top).astype(np.float32)
     known, lit = (_interpolated(grid, x, y) for grid in (known, lit))
     share: Array = np.where(known > 1e-3, lit / known.clip(1e-3), 1.0).clip(0, 1)
     return share
 
 
 def _interpolated(grid: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> Array:
-    columns, rows = np.floor(x[:, 0]).astype(np.int64), np.floor(y[:, 0]).astype(np.int64)
-    right, below = x[:, 0] - columns, y[:, 0] - rows
+    """Bilinear values ``(N,)`` of a grid ``(h, w)`` at columns ``x`` and rows ``y``, both ``(N,)``."""
+    columns, rows = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, below = x - columns, y - rows
     following = np.minimum(columns + 1, grid.shape[1] - 1), np.minimum(rows + 1, grid.shape[0] - 1)
     upper = grid[rows, columns] * (1 - right) + grid[rows, following[0]] * right
     lower = grid[following[1], columns] * (1 - right) + grid[following[1], following[0]] * right
@@ -236,14 +267,14 @@ def _shaded(scene: Scene, kind: int, seen: Sight, lit: Array, lamp: Lamp, source
     return shade(albedo, seen.points, seen.normals, lit, lamp, source)
 
 
-def _edges(kind: NDArray[np.int8], normals: NDArray[np.float32]) -> Pixels:
-    """Pixels on either side of an outline or a sharp edge."""
+def _rough_pixels(
+    kind: NDArray[np.int8], normals: NDArray[np.float32], slanted: NDArray[np.bool_]
+) -> Pixels:
+    """Pixels that need more than one ray: on either side of an outline or a sharp edge, or seen at a slant."""
     rows, columns = np.nonzero(kind)
-    edge = np.zeros(kind.shape, bool)
+    edge = slanted.copy()
     if len(rows):
-        around = tuple(
-            slice(max(index.min() - 1, 0), index.max() + 2) for index in (rows, columns)
-        )
+        around = tuple(slice(max(index.min() - 1, 0), index.max() + 2) for index in (rows, columns))
         kind, normals, part = kind[around], normals[around], edge[around]
         for axis in (0, 1):
             a = tuple(slice(None, -1) if k == axis else slice(None) for k in (0, 1))
