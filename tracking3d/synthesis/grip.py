@@ -1,7 +1,7 @@
 """A hand that comes to an object, holds it while it is turned, and lets it go.
 
 Four fingers lie on one side of the object and the thumb on the other; where they touch its convex hull is worked out
-anew for every pose, so that fingers roll over what turns between them. The wrist goes along with a turn partly, the
+for every pose, so that fingers roll over what turns between them. The wrist goes along with a turn partly, the
 forearm always comes from the same side.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,9 @@ _OPEN = 0.4  # of fingers and thumb while the hand comes and leaves
 _SMALLEST, _LARGEST = 0.72, 1.05  # size of a hand in radii of the object
 _SHORTEST, _LONGEST = 0.35, 1.3  # how far the middle finger reaches over the object
 
-_SKINS = np.array([[0.62, 0.34, 0.22], [0.5, 0.25, 0.15], [0.3, 0.14, 0.08], [0.68, 0.42, 0.3]])  # linear light
+_SKINS = np.array(
+    [[0.62, 0.34, 0.22], [0.5, 0.25, 0.15], [0.3, 0.14, 0.08], [0.68, 0.42, 0.3]]
+)  # linear light
 _CLOTHS = np.array([[0.05, 0.06, 0.1], [0.3, 0.3, 0.32], [0.25, 0.06, 0.05], [0.07, 0.16, 0.12]])
 
 
@@ -228,8 +231,8 @@ def _side(rng: np.random.Generator, R_cam_rest: Array) -> Array:
     side = rng.choice([-1.0, 1.0])
     aside, up = math.radians(rng.uniform(-5, 35)), math.radians(rng.uniform(15, 40))
     level = [v * (1, 0, 1) / np.linalg.norm(v * (1, 0, 1)) for v in (right, near)]
-    x = math.cos(up) * (math.cos(aside) * side * level[0] + math.sin(aside) * level[1])
-    x = x + (0, math.sin(up), 0)
+    sideways = math.cos(aside) * side * level[0] + math.sin(aside) * level[1]
+    x = math.cos(up) * sideways + np.array([0, math.sin(up), 0])
     # The fingers are on the side of the camera, or on the far side and the thumb before the object.
     front = near if rng.random() < 0.6 else -near
     z = front - (front @ x) * x
@@ -287,11 +290,11 @@ def _bent(hand: GrippingHand, time: float) -> RayMesh:
         joints = np.column_stack([x[k], np.full(3, row), above[k] + lift])
         knuckle = np.array([0.05 * s, row, 0.04 * s])
         points = [knuckle, *joints]
-        limbs += [Limb(a, b, _FINGER * s) for a, b in zip(points[:-1], points[1:], strict=True)]
+        limbs += [Limb(a, b, _FINGER * s) for a, b in pairwise(points)]
     lift = 0.9 * _THUMB * s + spread
     joints = np.column_stack([x[4], s * _THUMB_ROW * np.ones(3), -below - lift])
     points = [np.array([0.5, -0.3, -0.08]) * s, *joints]
-    limbs += [Limb(a, b, _THUMB * s) for a, b in zip(points[:-1], points[1:], strict=True)]
+    limbs += [Limb(a, b, _THUMB * s) for a, b in pairwise(points)]
     limbs.append(Limb(np.array([0.05, _ROWS[0], 0.02]) * s, np.array([0.05, _ROWS[3], 0.02]) * s, 0.13 * s))
     along = hand.forearm(time)
     wrist = np.array([_WRIST_X * s, 0.0, 0.0])

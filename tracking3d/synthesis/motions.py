@@ -59,8 +59,8 @@ class Path:
 def make_path(spec: SequenceSpec, camera: Camera, radius: float) -> Path:
     """The path of an object of this ``radius``; it reaches half a frame beyond both ends of the sequence.
 
-    The path of ``pick_up`` depends on the object's shape too: see `tracking3d.synthesis.pick_up`. In frame 0 the object's enclosing sphere is in the middle of the image and fills `SequenceSpec.fill` of its
-    height.
+    In frame 0 the object's enclosing sphere is in the middle of the image and fills `SequenceSpec.fill` of its
+    height. The path of ``pick_up`` depends on more than the radius: see `tracking3d.synthesis.pick_up`.
     """
     rng = spec.random("motion")
     last = max(spec.frames - 1, 1)

@@ -118,8 +118,7 @@ def make_hand(spec: SequenceSpec, path: Path, surface: RayMesh, radius: float, c
         reach = 0.5 * (near + far)
         tried = hand(reach)
         hidden = max(
-            hidden_share(solid, tried.T_cam_hand(time), seen)
-            for time, seen in zip(frames, rays, strict=True)
+            hidden_share(solid, tried.T_cam_hand(time), seen) for time, seen in zip(frames, rays, strict=True)
         )
         near, far = (near, reach) if hidden < MOST_HIDDEN * strength else (reach, far)
     return hand(far)

@@ -58,8 +58,8 @@ class Schedule:
         """The schedule of a sequence."""
         last = max(spec.frames - 1, 1)
         start = float(min(spec.still_frames, last // 2))
-        ends = start + (last - start) * np.cumsum([_COME, _LIFT, _TURN, _LOWER])
-        return cls(start, *ends.tolist(), float(last))
+        grasp, lifted, lower, released = start + (last - start) * np.cumsum([_COME, _LIFT, _TURN, _LOWER])
+        return cls(start, float(grasp), float(lifted), float(lower), float(released), float(last))
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,9 +50,7 @@ def lamp_of_frame(scene: Scene, frame: int) -> Lamp:
     return replace(lamp, position=T[:3, :3] @ lamp.position + T[:3, 3])
 
 
-def look_at(
-    scene: Scene, surface: RayMesh, T: Array, offset: Array, pixels: Pixels | None = None
-) -> Sight:
+def look_at(scene: Scene, surface: RayMesh, T: Array, offset: Array, pixels: Pixels | None = None) -> Sight:
     """Cast one ray a pixel at a solid of pose ``T`` ``(4, 4)``.
 
     Args:

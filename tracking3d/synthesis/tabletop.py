@@ -20,7 +20,10 @@ from tracking3d.synthesis.texture_lookup import filter_texture
 
 Array = NDArray[np.float64]
 
-_FINER, _MARGIN = 1.25, 0.1  # of the picture: pixels per pixel, and what it shows beyond each side, of the height
+_FINER, _MARGIN = (
+    1.25,
+    0.1,
+)  # of the picture: pixels per pixel, and what it shows beyond each side, of the height
 _TABLE, _WALL = (1280, 10.0), (768, 16.0)  # texels a side, and length of a side in object radii
 _ROWS_AT_ONCE = 128
 

@@ -1,8 +1,9 @@
 """Frames of an object that a hand takes from a table, at the size of a phone's video.
 
-Unlike with other motions not all pixels get several rays: the table is seen through homographies, the light on it is
-worked out on a coarse grid, and only pixels on outlines and edges of the object and the hand are cast at more than
-once, and what is seen at a slant. Shadows are soft: they are asked for at a part of the pixels, with several points of the lamp.
+Unlike with other motions not all pixels get several rays. The table is seen through homographies, and the light on it
+is worked out on a coarse grid. Only pixels on outlines and edges of the object and the hand, and those that see the
+object at a slant, are cast at more than once. Shadows are soft: they are asked for at a part of the pixels, with
+several points of the lamp.
 """
 
 from __future__ import annotations
@@ -50,9 +51,7 @@ class _Solid:
     T: Array
 
 
-def render_tabletop(
-    scene: Scene, tabletop: Tabletop, frame: int
-) -> tuple[NDArray[np.float32], Array, Array]:
+def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArray[np.float32], Array, Array]:
     """Light ``(H, W, 3)`` of a frame, and the depths ``(H, W)`` of object and hand, infinite outside them."""
     lamp = lamp_of_frame(scene, frame)
     solids = [_Solid(scene.surface, scene.path.T_cam_obj(np.array([float(frame)]))[0])]
@@ -93,7 +92,7 @@ def _surroundings(
         if not len(seen):
             continue
         top, bottom = int(seen[0]) // step * step, int(seen[-1]) + 1
-        to_plane = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest))
+        to_plane: Array = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest))
         lower = np.array([[1.0, 0, 0], [0, 1, top], [0, 0, 1]])
         albedo = cv2.warpPerspective(
             plane.picture,
@@ -104,8 +103,8 @@ def _surroundings(
         )
         columns, rows = np.meshgrid(np.arange(-(-width // step)), np.arange(top // step, -(-bottom // step)))
         # cv2.resize takes pixel centres of the grid to the middle of their cells.
-        x, y = (step * (index + 0.5) - 0.5 for index in (columns, rows))
-        received = _light_on(scene, plane, T_cam_rest, to_plane, (x, y), solids, lamp)
+        pixels = step * (np.stack([columns, rows]).astype(np.float64) + 0.5) - 0.5
+        received = _light_on(scene, plane, T_cam_rest, to_plane, pixels, solids, lamp)
         full = cv2.resize(received, (step * columns.shape[1], step * columns.shape[0]))
         factor = full[: bottom - top, :width] * share[top:bottom]
         light[top:bottom] += albedo * factor[..., None]
@@ -130,12 +129,12 @@ def _light_on(
     plane: Plane,
     T_cam_rest: Array,
     to_plane: Array,
-    pixels: tuple[Array, Array],
+    pixels: Array,
     solids: list[_Solid],
     lamp: Lamp,
 ) -> NDArray[np.float32]:
-    """Light that a plane receives at ``pixels``, x and y both ``(h, w)``: ``(h, w)``."""
-    x, y, w = to_plane @ np.stack([pixels[0].ravel(), pixels[1].ravel(), np.ones(pixels[0].size)])
+    """Light ``(h, w)`` that a plane receives where ``pixels``, x and y ``(2, h, w)``, see it."""
+    x, y, w = to_plane @ np.concatenate([pixels.reshape(2, -1), np.ones((1, pixels[0].size))])
     w = np.where(np.abs(w) > 1e-12, w, 1e-12)
     R, t = T_cam_rest[:3, :3], T_cam_rest[:3, 3]
     place = np.stack([x / w, y / w], 1)
@@ -267,9 +266,7 @@ def _shaded(scene: Scene, kind: int, seen: Sight, lit: Array, lamp: Lamp, source
     return shade(albedo, seen.points, seen.normals, lit, lamp, source)
 
 
-def _rough_pixels(
-    kind: NDArray[np.int8], normals: NDArray[np.float32], slanted: NDArray[np.bool_]
-) -> Pixels:
+def _rough_pixels(kind: NDArray[np.int8], normals: NDArray[np.float32], slanted: NDArray[np.bool_]) -> Pixels:
     """Pixels that need more than one ray: on either side of an outline or a sharp edge, or seen at a slant."""
     rows, columns = np.nonzero(kind)
     edge = slanted.copy()
