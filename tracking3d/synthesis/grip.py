@@ -34,8 +34,8 @@ _FINGER, _THUMB, _WRIST, _SLEEVE = 0.1, 0.12, 0.2, 0.27  # radii
 _PALM = (0.42, 0.47, 0.2)
 _WRIST_X, _SLEEVE_X = 0.85, 1.12  # along the arm from the knuckles
 _OPEN = 0.4  # of fingers and thumb while the hand comes and leaves
-_SMALLEST, _LARGEST = 0.72, 1.05  # size of a hand in radii of the object
-_SHORTEST, _LONGEST = 0.35, 1.3  # how far the middle finger reaches over the object
+_SMALLEST, _LARGEST = 0.55, 1.05  # size of a hand in radii of the object
+_SHORTEST, _LONGEST = 0.3, 1.3  # how far the middle finger reaches over the object
 
 _SKINS = np.array(
     [[0.62, 0.34, 0.22], [0.5, 0.25, 0.15], [0.3, 0.14, 0.08], [0.68, 0.42, 0.3]]

@@ -30,9 +30,14 @@ def stick_label(
     angle = rng.uniform(0, 2 * math.pi)
     out = np.array([math.cos(angle), 0.0, math.sin(angle)])
     across = np.array([-out[2], 0.0, out[0]])
-    owner, points, uvs = _sample(patches, rng)
+    owner, points, normals, uvs = _sample(patches, rng)
+    share = np.bincount(owner, minlength=len(patches))
+    large = share[owner] > 0.5 * share.max()  # no label on a handle
+    fit = large & (normals @ out > 0.3)  # nor on the inside
+    owner, points, normals, uvs = owner[fit], points[fit], normals[fit], uvs[fit]
     best = int((points @ out - 1.5 * np.abs(points[:, 1]) - 0.5 * np.abs(points @ across)).argmax())
-    near = (owner == owner[best]) & (np.linalg.norm(points - points[best], axis=1) < _AROUND)
+    near = (owner == owner[best]) & (normals @ normals[best] > 0.5)
+    near &= np.linalg.norm(points - points[best], axis=1) < _AROUND
     # Texture coordinates are nearly linear in the place on the surface.
     slope = np.linalg.lstsq(points[near] - points[best], uvs[near] - uvs[best], rcond=1e-2)[0]
     size = np.array([rng.uniform(*_WIDTH), rng.uniform(*_HEIGHT)]) * np.linalg.norm(slope, axis=0)
@@ -49,12 +54,20 @@ def stick_label(
     return [labelled if k == owner[best] else one for k, one in enumerate(panels)]
 
 
-def _sample(patches: Sequence[Patch], rng: np.random.Generator) -> tuple[NDArray[np.int64], Array, Array]:
-    """Points all over the surface ``(N, 3)``, which patch each is on ``(N,)``, and its coordinates there ``(N, 2)``."""
+def _sample(
+    patches: Sequence[Patch], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Points all over the surface.
+
+    Returns:
+        Which patch each point is on ``(N,)``, its place and normal ``(N, 3)``, and its texture coordinates ``(N, 2)``.
+    """
     owner = np.concatenate([np.full(len(patch.faces), k) for k, patch in enumerate(patches)])
     corners = np.concatenate([patch.vertices[patch.faces] for patch in patches])
     uvs = np.concatenate([patch.uvs[patch.faces] for patch in patches])
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
     faces = rng.choice(len(area), _SAMPLES, p=area / area.sum())
     weights = rng.dirichlet(np.ones(3), _SAMPLES)[:, :, None]
-    return owner[faces], (weights * corners[faces]).sum(1), (weights * uvs[faces]).sum(1)
+    places = (weights * corners[faces]).sum(1)
+    return owner[faces], places, across[faces] / area[faces, None], (weights * uvs[faces]).sum(1)

@@ -30,10 +30,11 @@ _SHAPES = ("box", "bottle", "mug")  # with each kind of print; the fourth thing 
 _OTHERS = ("wedge", "organic", "assembly", "knob", "bowl", "blob")
 
 _STILL = (30, 90)  # frames
-_HANDLED = (120, 132)  # frames from when the hand sets out
+_HANDLED = (120, 128)  # frames from when the hand sets out
 _SPEED = (5.2, 6.2)  # mean degrees a frame while the object turns
 _FOV = (65.0, 75.0)  # degrees, along the long side
-_FILL = (0.23, 0.3)
+_FILL = {"bottle": (0.3, 0.37)}  # a slender thing seems smaller than the sphere around it
+_USUAL_FILL = (0.23, 0.29)
 
 
 def phone_name(seed: int) -> str:
@@ -87,7 +88,7 @@ def _sequence(seed: int, index: int, shape: str, kind: str) -> SequenceSpec:
         size=SIZE,
         fov=round(float(rng.uniform(*_FOV)), 2),
         camera_told=False,
-        fill=round(float(rng.uniform(*_FILL)), 3),
+        fill=round(float(rng.uniform(*_FILL.get(shape, _USUAL_FILL))), 3),
         lamp=lamp,
         disturbances=Disturbances(
             highlights=round(float(rng.uniform(0.1, 0.35)), 2) if glossy else 0.0,

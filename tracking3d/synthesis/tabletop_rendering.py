@@ -9,6 +9,7 @@ several points of the lamp.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -33,7 +34,8 @@ Array = NDArray[np.float64]
 
 _COARSE = 240  # cells of the grid of light per image height
 _SEARCH = 160  # rays per image height with which the hand is searched
-_SHADOW_RAYS, _SHADOW_RAYS_BELOW = 4, 7  # points of the lamp for object and hand, and for table and wall
+_SHADOW_RAYS, _SHADOW_RAYS_BELOW = 4, 9  # points of the lamp for object and hand, and for table and wall
+_OUTERMOST = 5  # the last of them, which are at the rim of the lamp
 _SPARSE = 3  # pixels from one to the next at which shadows on object and hand are asked for
 _EDGE = 0.9  # cosine between neighbouring normals below which there is an edge
 _SLANTED = 0.25  # cosine between normal and ray below which one ray a pixel would miss texels
@@ -50,6 +52,12 @@ class _Solid:
     surface: RayMesh
     T: Array
 
+    @cached_property
+    def vertices(self) -> Array:
+        """``(V, 3)`` in camera axes."""
+        vertices: Array = self.surface.vertices @ self.T[:3, :3].T.copy() + self.T[:3, 3]
+        return vertices
+
 
 def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArray[np.float32], Array, Array]:
     """Light ``(H, W, 3)`` of a frame, and the depths ``(H, W)`` of object and hand, infinite outside them."""
@@ -64,6 +72,7 @@ def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArr
     normals = np.zeros((*light.shape[:2], 3), np.float32)
     slanted = np.zeros(light.shape[:2], bool)
     empty = light.copy()
+    lit_parts = []
     for k, solid in enumerate(solids):
         pixels = _pixels_of_hand(scene, solid) if k else _pixels_of_object(scene, solid)
         seen = look_at(scene, solid.surface, solid.T, np.zeros(2), pixels)
@@ -71,11 +80,12 @@ def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArr
         nearer = seen.depth <= depths[:, seen.pixels[0], seen.pixels[1]].min(0)
         lit = _lit_share(scene, solids, seen, lamp)
         colours = _shaded(scene, k, seen, lit, lamp, lamp.position)
+        lit_parts.append(_filled(lit, seen.pixels, light.shape[:2]))
         where = seen.pixels[0][nearer], seen.pixels[1][nearer]
         light[where], kind[where], normals[where] = colours[nearer], k + 1, seen.normals[nearer]
         facing = -np.einsum("ij,ij->i", seen.normals, seen.points) / np.linalg.norm(seen.points, axis=1)
         slanted[where] = (facing < _SLANTED)[nearer] if k == 0 else False
-    _smooth_edges(scene, solids, lamp, light, empty, _rough_pixels(kind, normals, slanted))
+    _smooth_edges(scene, solids, lit_parts, lamp, light, empty, _rough_pixels(kind, normals, slanted))
     return light, depths[0], depths[1]
 
 
@@ -92,7 +102,7 @@ def _surroundings(
         if not len(seen):
             continue
         top, bottom = int(seen[0]) // step * step, int(seen[-1]) + 1
-        to_plane: Array = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest))
+        to_plane = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest)).astype(np.float64)
         lower = np.array([[1.0, 0, 0], [0, 1, top], [0, 0, 1]])
         albedo = cv2.warpPerspective(
             plane.picture,
@@ -138,7 +148,7 @@ def _light_on(
     w = np.where(np.abs(w) > 1e-12, w, 1e-12)
     R, t = T_cam_rest[:3, :3], T_cam_rest[:3, 3]
     place = np.stack([x / w, y / w], 1)
-    points = (plane.origin + place @ plane.axes[:, :2].T) @ R.T + t
+    points = place @ (R @ plane.axes[:, :2]).T.copy() + (R @ plane.origin + t)
     normal = R @ plane.axes[:, 2]
     towards = lamp.position - points
     cosine = (towards @ normal / np.linalg.norm(towards, axis=1)).clip(0)
@@ -149,7 +159,7 @@ def _light_on(
         near = np.flatnonzero(near)
         lit[near] *= _unblocked(solid, points[near] + LIFT * scene.solid.radius * normal, sources)
     received = (AMBIENT + DIFFUSE * cosine * lit).astype(np.float32)
-    return cv2.GaussianBlur(received.reshape(pixels[0].shape), (0, 0), 0.6)
+    return cv2.GaussianBlur(received.reshape(pixels[0].shape), (0, 0), 1.0)
 
 
 def _may_be_shadowed(
@@ -158,13 +168,12 @@ def _may_be_shadowed(
     """Whether points of a plane ``(N,)`` are in the rectangle around the shadow of a solid."""
     to_plane = np.linalg.inv(T_cam_rest)
 
-    def along_axes(points: Array) -> Array:
-        return (points @ to_plane[:3, :3].T + to_plane[:3, 3] - plane.origin) @ plane.axes
-
-    vertices = along_axes(solid.surface.vertices @ solid.T[:3, :3].T + solid.T[:3, 3])
+    to_axes = to_plane[:3, :3].T @ plane.axes
+    shift = (to_plane[:3, 3] - plane.origin) @ plane.axes
+    vertices = solid.vertices @ to_axes + shift
     inside = np.zeros(len(place), bool)
     lows, highs = [], []
-    for source in along_axes(sources):
+    for source in sources[-_OUTERMOST:] @ to_axes + shift:
         below = source[2] - vertices[:, 2]
         ahead = below > 1e-3 * source[2]  # what is as high as the lamp throws its shadow far away
         if not ahead.any():
@@ -188,7 +197,7 @@ def _unblocked(solid: _Solid, points: Array, sources: Array) -> Array:
 
 def _pixels_of_object(scene: Scene, solid: _Solid) -> Pixels | None:
     """Pixels of the convex outline of the object; None if it reaches behind the camera."""
-    corners = camera_to_pixels(scene.camera, solid.surface.vertices @ solid.T[:3, :3].T + solid.T[:3, 3])
+    corners = camera_to_pixels(scene.camera, solid.vertices)
     if np.isnan(corners).any() or np.abs(corners).max() > _FAR_OUT:
         return None
     hull = cv2.convexHull(corners.astype(np.float32)).round().astype(np.int32)
@@ -246,6 +255,15 @@ def _lit_share(scene: Scene, solids: list[_Solid], seen: Sight, lamp: Lamp) -> A
     return share
 
 
+def _filled(lit: Array, pixels: Pixels, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """How much of the lamp is seen in all pixels ``(H, W)``: beyond an outline what is darkest beside it."""
+    known = np.ones(shape, np.float32)
+    known[pixels] = lit
+    around: NDArray[np.float32] = cv2.erode(known, np.ones((3, 3), np.uint8))
+    around[pixels] = lit
+    return around
+
+
 def _interpolated(grid: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> Array:
     """Bilinear values ``(N,)`` of a grid ``(h, w)`` at columns ``x`` and rows ``y``, both ``(N,)``."""
     columns, rows = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
@@ -288,12 +306,16 @@ def _rough_pixels(kind: NDArray[np.int8], normals: NDArray[np.float32], slanted:
 def _smooth_edges(
     scene: Scene,
     solids: list[_Solid],
+    lit_parts: list[NDArray[np.float32]],
     lamp: Lamp,
     light: NDArray[np.float32],
     empty: NDArray[np.float32],
     pixels: Pixels,
 ) -> None:
-    """Average several rays in some pixels of ``light``, where rays that meet nothing see ``empty``."""
+    """Average several rays in some pixels of ``light``, where rays that meet nothing see ``empty``.
+
+    How much of the lamp is seen there, ``lit_parts`` ``(H, W)`` of each solid, is not asked for again.
+    """
     side = scene.spec.supersample
     if side == 1 or not len(pixels[0]):
         return
@@ -302,7 +324,6 @@ def _smooth_edges(
     total = light[pixels].astype(np.float64)
     index = np.full(light.shape[:2], -1, np.int64)
     index[pixels] = np.arange(len(pixels[0]))
-    lift = LIFT * scene.solid.radius
     for k, source in enumerate(lamp.points(side**2)):
         if k == side**2 // 2:
             continue  # the middle ray is there already
@@ -310,9 +331,7 @@ def _smooth_edges(
         nearest = np.full(len(sample), np.inf)
         for kind, solid in enumerate(solids):
             seen = look_at(scene, solid.surface, solid.T, offsets[k], pixels)
-            lit = np.ones(len(seen.depth), bool)
-            for other in solids:
-                lit &= ~in_shadow(other.surface, other.T, seen, source, lift)
+            lit = lit_parts[kind][seen.pixels].astype(np.float64)
             place = index[seen.pixels]
             nearer = seen.depth < nearest[place]
             colours = _shaded(scene, kind, seen, lit, lamp, source)

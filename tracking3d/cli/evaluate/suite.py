@@ -17,8 +17,8 @@ def suite(
         str,
         typer.Argument(
             metavar="NAME",
-            help="Dataset: smoke, standard, hard, full, fresh or phone (synthetic), real, the name of a dataset layout, or "
-            "a YAML file with one.",
+            help="Dataset: smoke, standard, hard, full, fresh or phone (synthetic), real, the name of a dataset "
+            "layout, or a YAML file with one.",
         ),
     ],
     seed: Annotated[
