@@ -20,7 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.synthesis.hand_solid import Limb, hand_surface
 from tracking3d.synthesis.motions import Path
 from tracking3d.synthesis.occluder import MOST_HIDDEN, hidden_share, object_rays
-from tracking3d.synthesis.pick_up import Handling, handling_at, smooth_step
+from tracking3d.synthesis.pick_up import Handling, smooth_step
 from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -30,11 +30,11 @@ Array = NDArray[np.float64]
 _ROWS = np.array([-0.34, -0.115, 0.115, 0.33])  # of the fingers, along y
 _LENGTHS = np.array([0.85, 1.0, 1.05, 0.9])  # of the fingers relative to each other
 _THUMB_ROW = -0.2
-_FINGER, _THUMB, _WRIST, _SLEEVE = 0.1, 0.12, 0.2, 0.27  # radii
+_FINGER, _THUMB, _WRIST, _SLEEVE = 0.108, 0.125, 0.2, 0.27  # radii
 _PALM = (0.42, 0.47, 0.2)
 _WRIST_X, _SLEEVE_X = 0.85, 1.12  # along the arm from the knuckles
 _OPEN = 0.4  # of fingers and thumb while the hand comes and leaves
-_SMALLEST, _LARGEST = 0.55, 1.05  # size of a hand in radii of the object
+_SMALLEST, _LARGEST = 0.6, 1.05  # size of a hand in radii of the object
 _SHORTEST, _LONGEST = 0.3, 1.3  # how far the middle finger reaches over the object
 
 _SKINS = np.array(
@@ -153,14 +153,14 @@ class GrippingHand:
 
     def _grip(self, time: float) -> tuple[Array, Array]:
         """Axes of the hand ``(3, 3)`` and the middle of its grip ``(3,)``, where the object stood."""
-        _, position, raised, follow = handling_at(self.handling, time)
+        _, position, raised, follow = self.handling.at(time)
         up = np.array([0.0, self.height * (1 - raised), 0.0])
         return follow.as_matrix() @ self.base, self.radius * position + up
 
     def _contact(self, time: float) -> Array:
         if self.contacts is not None:
             return self.contacts.at(time)
-        R_obj, position, *_ = handling_at(self.handling, time)
+        R_obj, position, *_ = self.handling.at(time)
         R, centre = self._grip(time)
         to_object = R_obj.T @ R
         return _touch(

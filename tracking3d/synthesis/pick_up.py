@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,21 @@ class Handling:
     positions: Array
     raised: Array
     follow: Array
+
+    @cached_property
+    def _rotation(self) -> Slerp:
+        return Slerp(self.times, self.rotations)
+
+    @cached_property
+    def _columns(self) -> Array:
+        return np.column_stack([self.positions, self.raised, self.follow]).T.copy()
+
+    def at(self, time: float) -> tuple[Array, Array, float, Rotation]:
+        """Rotation ``(3, 3)`` and position ``(3,)`` of the object, how far it is raised, how far the hand turned."""
+        time = float(np.clip(time, self.times[0], self.times[-1]))
+        R = self._rotation([time]).as_matrix()[0]
+        *values, a, b, c = (float(np.interp(time, self.times, column)) for column in self._columns)
+        return R, np.array(values[:3]), values[3], Rotation.from_rotvec([a, b, c])
 
 
 def plan_pick_up(spec: SequenceSpec, solid: Solid, camera: Camera) -> tuple[Path, Handling]:
@@ -213,12 +229,3 @@ def _level(direction: Array) -> Array:
     level = direction * (1, 0, 1)
     unit: Array = level / np.linalg.norm(level)
     return unit
-
-
-def handling_at(handling: Handling, time: float) -> tuple[Array, Array, float, Rotation]:
-    """Rotation ``(3, 3)`` and position ``(3,)`` of the object, how far it is raised, and how far the hand turned."""
-    time = float(np.clip(time, handling.times[0], handling.times[-1]))
-    R = Slerp(handling.times, handling.rotations)([time]).as_matrix()[0]
-    columns = np.column_stack([handling.positions, handling.raised, handling.follow]).T
-    *values, a, b, c = (float(np.interp(time, handling.times, column)) for column in columns)
-    return R, np.array(values[:3]), values[3], Rotation.from_rotvec([a, b, c])
