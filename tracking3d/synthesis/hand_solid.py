@@ -13,7 +13,7 @@ from tracking3d.synthesis.ray_casting import RayMesh
 
 Array = NDArray[np.float64]
 
-_AROUND, _RINGS = 16, 5  # facets around a limb, and rings of each of its round ends
+_AROUND, _RINGS = 20, 5  # facets around a limb, and rings of each of its round ends
 
 
 @dataclass(frozen=True, eq=False)
