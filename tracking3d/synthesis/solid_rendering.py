@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,20 @@ Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 LIFT = 1e-4
 """Of shadow rays off the surface, in object radii."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSolid:
+    """What stands in the light: a surface and its pose in camera axes."""
+
+    surface: RayMesh
+    T: Array
+
+    @cached_property
+    def vertices(self) -> Array:
+        """``(V, 3)`` in camera axes."""
+        vertices: Array = self.surface.vertices @ self.T[:3, :3].T.copy() + self.T[:3, 3]
+        return vertices
 
 
 @dataclass(frozen=True, eq=False)

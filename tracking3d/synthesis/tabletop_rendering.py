@@ -1,72 +1,53 @@
 """Frames of an object that a hand takes from a table, at the size of a phone's video.
 
-Unlike with other motions not all pixels get several rays. The table is seen through homographies, and the light on it
-is worked out on a coarse grid. Only pixels on outlines and edges of the object and the hand, and those that see the
-object at a slant, are cast at more than once. Shadows are soft: they are asked for at a part of the pixels, with
-several points of the lamp.
+Unlike with other motions not all pixels get several rays. Only pixels on outlines and edges of the object and the hand,
+and those that see the object at a slant, are cast at more than once. Shadows are soft: they are asked for at a part of
+the pixels, with several points of the lamp.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.lighting import AMBIENT, DIFFUSE, Lamp, shade
+from tracking3d.synthesis.lighting import Lamp, shade
 from tracking3d.synthesis.pixel_rays import camera_to_pixels, pixels_around
-from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.scene import Scene
 from tracking3d.synthesis.solid_rendering import (
     LIFT,
     Pixels,
+    PosedSolid,
     Sight,
     albedo_at,
     in_shadow,
     lamp_of_frame,
     look_at,
 )
-from tracking3d.synthesis.tabletop import Plane, Tabletop
+from tracking3d.synthesis.tabletop import Tabletop
+from tracking3d.synthesis.tabletop_light import surroundings_light
 
 Array = NDArray[np.float64]
 
-_COARSE = 240  # cells of the grid of light per image height
 _SEARCH = 160  # rays per image height with which the hand is searched
-_SHADOW_RAYS, _SHADOW_RAYS_BELOW = 4, 9  # points of the lamp for object and hand, and for table and wall
-_OUTERMOST = 5  # the last of them, which are at the rim of the lamp
+_SHADOW_RAYS = 4  # points of the lamp
 _SPARSE = 3  # pixels from one to the next at which shadows on object and hand are asked for
 _EDGE = 0.9  # cosine between neighbouring normals below which there is an edge
 _SLANTED = 0.25  # cosine between normal and ray below which one ray a pixel would miss texels
 
 _FAR_OUT = 20_000  # pixels; what is drawn farther out could overflow
 
-_NOTHING, _OBJECT, _HAND = 0, 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class _Solid:
-    """What stands in the light: a surface and its pose in camera axes."""
-
-    surface: RayMesh
-    T: Array
-
-    @cached_property
-    def vertices(self) -> Array:
-        """``(V, 3)`` in camera axes."""
-        vertices: Array = self.surface.vertices @ self.T[:3, :3].T.copy() + self.T[:3, 3]
-        return vertices
+_NOTHING = 0  # what a pixel sees; k + 1 is the solid of index k
 
 
 def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArray[np.float32], Array, Array]:
     """Light ``(H, W, 3)`` of a frame, and the depths ``(H, W)`` of object and hand, infinite outside them."""
     lamp = lamp_of_frame(scene, frame)
-    solids = [_Solid(scene.surface, scene.path.T_cam_obj(np.array([float(frame)]))[0])]
+    solids = [PosedSolid(scene.surface, scene.path.T_cam_obj(np.array([float(frame)]))[0])]
     if scene.hand is not None and (surface := scene.hand.surface_at(float(frame))) is not None:
-        solids.append(_Solid(surface, scene.hand.T_cam_hand(float(frame))))
+        solids.append(PosedSolid(surface, scene.hand.T_cam_hand(float(frame))))
     T_cam_rest = scene.path.T_cam_rest(np.array([float(frame)]))[0]
-    light = _surroundings(scene, tabletop, T_cam_rest, solids, lamp)
+    light = surroundings_light(scene, tabletop, T_cam_rest, solids, lamp)
     depths = np.full((2, *light.shape[:2]), np.inf)
     kind = np.full(light.shape[:2], _NOTHING, np.int8)
     normals = np.zeros((*light.shape[:2], 3), np.float32)
@@ -89,113 +70,7 @@ def render_tabletop(scene: Scene, tabletop: Tabletop, frame: int) -> tuple[NDArr
     return light, depths[0], depths[1]
 
 
-def _surroundings(
-    scene: Scene, tabletop: Tabletop, T_cam_rest: Array, solids: list[_Solid], lamp: Lamp
-) -> NDArray[np.float32]:
-    """Linear light ``(H, W, 3)`` of table and wall with the shadows of the ``solids`` on them."""
-    width, height = scene.camera.width, scene.camera.height
-    step = max(1, round(height / _COARSE))
-    light = np.zeros((height, width, 3), np.float32)
-    on_table = _table_share(scene, tabletop, T_cam_rest)
-    for plane, share in ((tabletop.table, on_table), (tabletop.wall, 1 - on_table)):
-        seen = np.flatnonzero(share.any(1))
-        if not len(seen):
-            continue
-        top, bottom = int(seen[0]) // step * step, int(seen[-1]) + 1
-        to_plane = np.linalg.inv(plane.to_pixels(scene.camera.K, T_cam_rest)).astype(np.float64)
-        lower = np.array([[1.0, 0, 0], [0, 1, top], [0, 0, 1]])
-        albedo = cv2.warpPerspective(
-            plane.picture,
-            plane.to_picture @ to_plane @ lower,
-            (width, bottom - top),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        columns, rows = np.meshgrid(np.arange(-(-width // step)), np.arange(top // step, -(-bottom // step)))
-        # cv2.resize takes pixel centres of the grid to the middle of their cells.
-        pixels = step * (np.stack([columns, rows]).astype(np.float64) + 0.5) - 0.5
-        received = _light_on(scene, plane, T_cam_rest, to_plane, pixels, solids, lamp)
-        full = cv2.resize(received, (step * columns.shape[1], step * columns.shape[0]))
-        factor = full[: bottom - top, :width] * share[top:bottom]
-        light[top:bottom] += albedo * factor[..., None]
-    light *= lamp.brightness.astype(np.float32)
-    return light
-
-
-def _table_share(scene: Scene, tabletop: Tabletop, T_cam_rest: Array) -> NDArray[np.float32]:
-    """Share of each pixel ``(H, W)`` that shows the table and not the wall."""
-    H = tabletop.wall.to_pixels(scene.camera.K, T_cam_rest)
-    line = np.cross(H @ (-1.0, 0.0, 1.0), H @ (1.0, 0.0, 1.0))  # where they meet
-    line /= np.linalg.norm(line[:2])
-    x = np.arange(scene.camera.width, dtype=np.float32)
-    y = np.arange(scene.camera.height, dtype=np.float32)
-    a, b, c = (line if line[1] > 0 else -line).astype(np.float32)
-    share: NDArray[np.float32] = (a * x + b * y[:, None] + c + 0.5).clip(0, 1)
-    return share
-
-
-def _light_on(
-    scene: Scene,
-    plane: Plane,
-    T_cam_rest: Array,
-    to_plane: Array,
-    pixels: Array,
-    solids: list[_Solid],
-    lamp: Lamp,
-) -> NDArray[np.float32]:
-    """Light ``(h, w)`` that a plane receives where ``pixels``, x and y ``(2, h, w)``, see it."""
-    x, y, w = to_plane @ np.concatenate([pixels.reshape(2, -1), np.ones((1, pixels[0].size))])
-    w = np.where(np.abs(w) > 1e-12, w, 1e-12)
-    R, t = T_cam_rest[:3, :3], T_cam_rest[:3, 3]
-    place = np.stack([x / w, y / w], 1)
-    points = place @ (R @ plane.axes[:, :2]).T.copy() + (R @ plane.origin + t)
-    normal = R @ plane.axes[:, 2]
-    towards = lamp.position - points
-    cosine = (towards @ normal / np.linalg.norm(towards, axis=1)).clip(0)
-    lit = np.ones(len(points))
-    sources = lamp.points(_SHADOW_RAYS_BELOW)
-    for solid in solids:
-        near = (cosine > 0) & (points[:, 2] > 0) & _may_be_shadowed(plane, T_cam_rest, solid, place, sources)
-        near = np.flatnonzero(near)
-        lit[near] *= _unblocked(solid, points[near] + LIFT * scene.solid.radius * normal, sources)
-    received = (AMBIENT + DIFFUSE * cosine * lit).astype(np.float32)
-    return cv2.GaussianBlur(received.reshape(pixels[0].shape), (0, 0), 1.0)
-
-
-def _may_be_shadowed(
-    plane: Plane, T_cam_rest: Array, solid: _Solid, place: Array, sources: Array
-) -> NDArray[np.bool_]:
-    """Whether points of a plane ``(N,)`` are in the rectangle around the shadow of a solid."""
-    to_plane = np.linalg.inv(T_cam_rest)
-
-    to_axes = to_plane[:3, :3].T @ plane.axes
-    shift = (to_plane[:3, 3] - plane.origin) @ plane.axes
-    vertices = solid.vertices @ to_axes + shift
-    inside = np.zeros(len(place), bool)
-    lows, highs = [], []
-    for source in sources[-_OUTERMOST:] @ to_axes + shift:
-        below = source[2] - vertices[:, 2]
-        ahead = below > 1e-3 * source[2]  # what is as high as the lamp throws its shadow far away
-        if not ahead.any():
-            continue
-        cast = source[:2] + (vertices[ahead, :2] - source[:2]) * (source[2] / below[ahead])[:, None]
-        lows.append(cast.min(0))
-        highs.append(cast.max(0))
-    if lows:
-        inside = ((place >= np.min(lows, 0)) & (place <= np.max(highs, 0))).all(1)
-    return inside
-
-
-def _unblocked(solid: _Solid, points: Array, sources: Array) -> Array:
-    """Share of the lamp's points ``sources`` ``(K, 3)`` that a solid does not hide from points ``(N, 3)``."""
-    R, t = solid.T[:3, :3], solid.T[:3, 3]
-    origins = (points - t) @ R
-    blocked = [solid.surface.is_blocked(origins, (source - points) @ R) for source in sources]
-    share: Array = 1 - np.mean(blocked, 0)
-    return share
-
-
-def _pixels_of_object(scene: Scene, solid: _Solid) -> Pixels | None:
+def _pixels_of_object(scene: Scene, solid: PosedSolid) -> Pixels | None:
     """Pixels of the convex outline of the object; None if it reaches behind the camera."""
     corners = camera_to_pixels(scene.camera, solid.vertices)
     if np.isnan(corners).any() or np.abs(corners).max() > _FAR_OUT:
@@ -207,7 +82,7 @@ def _pixels_of_object(scene: Scene, solid: _Solid) -> Pixels | None:
     return found[0], found[1]
 
 
-def _pixels_of_hand(scene: Scene, hand: _Solid) -> Pixels:
+def _pixels_of_hand(scene: Scene, hand: PosedSolid) -> Pixels:
     """Pixels around all that a coarse grid of rays meets of a hand, whose arm may reach behind the camera."""
     width, height = scene.camera.width, scene.camera.height
     step = max(1, round(height / _SEARCH))
@@ -225,7 +100,7 @@ def _pixels_of_hand(scene: Scene, hand: _Solid) -> Pixels:
     return found[0], found[1]
 
 
-def _lit_share(scene: Scene, solids: list[_Solid], seen: Sight, lamp: Lamp) -> Array:
+def _lit_share(scene: Scene, solids: list[PosedSolid], seen: Sight, lamp: Lamp) -> Array:
     """How much of the lamp is seen from the points of a sight ``(N,)``; worked out at a part of the pixels."""
     rows, columns = seen.pixels
     if not len(rows):
@@ -305,7 +180,7 @@ def _rough_pixels(kind: NDArray[np.int8], normals: NDArray[np.float32], slanted:
 
 def _smooth_edges(
     scene: Scene,
-    solids: list[_Solid],
+    solids: list[PosedSolid],
     lit_parts: list[NDArray[np.float32]],
     lamp: Lamp,
     light: NDArray[np.float32],
