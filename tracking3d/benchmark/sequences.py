@@ -10,9 +10,8 @@ from pathlib import Path
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import list_sequences
 from tracking3d.errors import InputError
-from tracking3d.synthesis.fresh import FRESH, seed_of
 from tracking3d.synthesis.spec import SequenceSpec
-from tracking3d.synthesis.suite import SUITE_VERSION, SUITES, make_suite
+from tracking3d.synthesis.suite import SUITE_VERSION, is_suite, make_suite
 
 REAL = "real"
 
@@ -68,8 +67,8 @@ def open_dataset(
     """Find a dataset by name; a synthetic suite that is not there yet is made.
 
     Args:
-        name: One of `SUITES`; ``fresh-SEED``; ``real`` for a folder of clips in our own layout; the name of a
-            dataset's layout; or a YAML file of one.
+        name: One of the fixed suites; ``fresh-SEED`` or ``phone-SEED``; ``real`` for a folder of clips in our own
+            layout; the name of a dataset's layout; or a YAML file of one.
         data: Folder of the dataset; a synthetic suite's default is ``out/data/NAME``.
         out: Folder of the benchmark.
         jobs: Processes that make a suite.
@@ -79,7 +78,7 @@ def open_dataset(
     Raises:
         InputError: If there is no such dataset, or it holds no sequence.
     """
-    if specs is not None or name in (*SUITES, FRESH) or seed_of(name) is not None:
+    if specs is not None or is_suite(name):
         folder = data or out / "data" / name
         made = make_suite(name, folder, specs=specs, jobs=jobs, listener=listener)
         return Dataset(name, SUITE_VERSION, "clip", folder, tuple(path.name for path in made))

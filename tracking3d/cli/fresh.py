@@ -32,14 +32,18 @@ def draw_suite(
         InputError: The options do not go with the suite, or have no meaning.
     """
     from tracking3d.synthesis.fresh import COUNT, FRESH, fresh_name, fresh_suite
+    from tracking3d.synthesis.phone import PHONE, phone_name, phone_suite
 
-    if name == FRESH:
-        if seed is None:
-            raise InputError(f"The suite {FRESH} is drawn from a seed; give one with --seed N.")
+    if name in (FRESH, PHONE) and seed is None:
+        raise InputError(f"The suite {name} is drawn from a seed; give one with --seed N.")
+    if name == FRESH and seed is not None:
         specs = fresh_suite(seed, COUNT if count is None else count, meshes)
         return fresh_name(seed, meshes), specs
-    options = {"--seed": seed, "--count": count, "--meshes": meshes}
+    options = {"--seed": None if name == PHONE else seed, "--count": count, "--meshes": meshes}
     for option, value in options.items():
         if value is not None:
-            raise InputError(f"{option} applies to the suite {FRESH} only, not to {name}; leave it out.")
+            suites = f"the suites {FRESH} and {PHONE}" if option == "--seed" else f"the suite {FRESH}"
+            raise InputError(f"{option} applies to {suites} only, not to {name}; leave it out.")
+    if name == PHONE and seed is not None:
+        return phone_name(seed), phone_suite(seed)
     return name, None

@@ -39,7 +39,8 @@ class SequenceOptions:
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Motion: tumble, turntable, turn_and_back, flip, fast, depth_drift, leave_and_return or walk_round.",
+            help="Motion: tumble, turntable, turn_and_back, flip, fast, depth_drift, leave_and_return, walk_round "
+            "or pick_up.",
             rich_help_panel=_ONE,
         ),
     ] = None
@@ -83,7 +84,9 @@ class SequenceOptions:
     ] = None
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Random seed; of the suite 'fresh' too.", rich_help_panel=_ONE),
+        typer.Option(
+            metavar="N", help="Random seed; of the suites 'fresh' and 'phone' too.", rich_help_panel=_ONE
+        ),
     ] = None
 
     def given(self) -> dict[str, Any]:
@@ -103,7 +106,8 @@ def synth(
     suite: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Suite: smoke, standard, hard or full; or fresh, which --seed draws."
+            metavar="NAME",
+            help="Suite: smoke, standard, hard or full; or fresh or phone, which --seed draws.",
         ),
     ] = None,
     count: Count = None,
@@ -138,7 +142,7 @@ def synth(
     """
     given = sequence.given()
     drawn = draw_suite(suite or "one sequence", sequence.seed if suite else None, count, meshes)
-    others = next((name for name in given if (suite, name) != ("fresh", "seed")), None)
+    others = next((name for name in given if suite not in ("fresh", "phone") or name != "seed"), None)
     if suite is not None and others:
         raise InputError(f"--{others} cannot change --suite {suite}, which is fixed; leave out one of them.")
     if suite is not None:
@@ -147,7 +151,7 @@ def synth(
         folders = _make_one(given, out, overwrite, quiet)
     else:
         raise InputError(
-            "Give a suite with --suite smoke, standard, hard, full or fresh, or one sequence with --object NAME."
+            "Give a suite with --suite smoke, standard, hard, full, fresh or phone, or one sequence with --object NAME."
         )
     if bop is not None:
         _export(folders, bop, quiet)

@@ -83,7 +83,7 @@ def lamp_at(spec: SequenceSpec, frame: int, centre: Array, radius: float) -> Lam
 
 
 def shade(
-    albedo: Array, points: Array, normals: Array, lit: NDArray[np.bool_], lamp: Lamp, source: Array
+    albedo: Array, points: Array, normals: Array, lit: NDArray[np.bool_] | Array, lamp: Lamp, source: Array
 ) -> Array:
     """Light ``(N, 3)`` that surface points send to the camera.
 
@@ -91,7 +91,7 @@ def shade(
         albedo: ``(N, 3)`` linear, in [0, 1].
         points: ``(N, 3)``.
         normals: ``(N, 3)`` unit, towards the camera.
-        lit: ``(N,)`` whether ``source`` is seen from there.
+        lit: ``(N,)`` whether ``source`` is seen from there, or how much of the lamp.
         lamp: The lamp.
         source: ``(3,)`` point of the lamp that shines.
     """

@@ -21,7 +21,7 @@ from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
 
-_STEPS = 16
+STEPS = 16
 """Points of a path per frame; between them rotations are interpolated along the shortest arc."""
 
 
@@ -33,11 +33,14 @@ class Path:
         times: ``(M,)`` in frames, increasing.
         rotations: M rotations, object to camera axes.
         positions: ``(M, 3)`` of the object's origin in camera coordinates.
+        rest: Path of the place where the object stood in frame 0, in the object's axes of that frame; None if
+            object and surroundings are one.
     """
 
     times: Array
     rotations: Rotation
     positions: Array
+    rest: Path | None = None
 
     def T_cam_obj(self, times: Array) -> Array:
         """Poses ``(N, 4, 4)`` at ``times`` ``(N,)``; what is beyond the ends takes the pose at the end."""
@@ -48,17 +51,21 @@ class Path:
             poses[:, k, 3] = np.interp(times, self.times, self.positions[:, k])
         return poses
 
+    def T_cam_rest(self, times: Array) -> Array:
+        """Poses ``(N, 4, 4)`` of the surroundings: those of the object if it never leaves its place."""
+        return (self.rest or self).T_cam_obj(times)
+
 
 def make_path(spec: SequenceSpec, camera: Camera, radius: float) -> Path:
     """The path of an object of this ``radius``; it reaches half a frame beyond both ends of the sequence.
 
     In frame 0 the object's enclosing sphere is in the middle of the image and fills `SequenceSpec.fill` of its
-    height.
+    height. The path of ``pick_up`` depends on more than the radius: see `tracking3d.synthesis.pick_up`.
     """
     rng = spec.random("motion")
     last = max(spec.frames - 1, 1)
-    times = np.linspace(-1, last + 1, _STEPS * (last + 2) + 1)
-    first = _STEPS
+    times = np.linspace(-1, last + 1, STEPS * (last + 2) + 1)
+    first = STEPS
     spin = _SPINS[spec.motion](times, last, math.radians(spec.degrees_per_frame), rng)
     walk = spec.motion == "walk_round"
     if walk:
@@ -104,7 +111,7 @@ def _turn_and_back(times: Array, last: int, speed: float, rng: np.random.Generat
 
 def _flip(times: Array, last: int, speed: float, rng: np.random.Generator) -> Array:
     """Over and over about an axis in the image, slow when a side faces the camera and fast when on edge."""
-    mean = speed * (times - times[_STEPS])
+    mean = speed * (times - times[STEPS])
     angle = rng.uniform(-0.5, 0.5)
     axis = np.array([math.sin(angle), math.cos(angle), 0.0])
     return speed * (1 - 0.6 * np.cos(2 * mean))[:, None] * axis
@@ -119,19 +126,19 @@ def _walk(times: Array, last: int, speed: float, rng: np.random.Generator) -> Ar
 def _random_walk(times: Array, spin: Array, rng: np.random.Generator) -> Rotation:
     """Rotations of a still object that a camera walks round: upright but for the hand that holds the camera."""
     azimuth = np.degrees(np.cumsum(spin[:, 1]) * (times[1] - times[0]))
-    azimuth += rng.uniform(0, 360) - azimuth[_STEPS]
-    height = rng.uniform(14, 34) + _waves(times, rng, 4.0, (35, 60)) + _waves(times, rng, 0.25, (5, 9))
-    roll = rng.uniform(-2, 2) + _waves(times, rng, 1.2, (15, 30)) + _waves(times, rng, 0.25, (5, 9))
+    azimuth += rng.uniform(0, 360) - azimuth[STEPS]
+    height = rng.uniform(14, 34) + waves(times, rng, 4.0, (35, 60)) + waves(times, rng, 0.25, (5, 9))
+    roll = rng.uniform(-2, 2) + waves(times, rng, 1.2, (15, 30)) + waves(times, rng, 0.25, (5, 9))
     return Rotation.from_euler("yxz", np.stack([azimuth, 180 + height, roll], 1), degrees=True)
 
 
 def _hand_shake(times: Array, rng: np.random.Generator, depth: float) -> Array:
     """How a hand-held camera misses its aim and comes nearer and goes farther ``(M, 3)``."""
-    aim = [_waves(times, rng, size, (20, 45)) + _waves(times, rng, 0.015, (5, 9)) for size in (0.12, 0.08)]
-    return np.stack([*aim, _waves(times, rng, 0.07 * depth, (30, 60))], 1)
+    aim = [waves(times, rng, size, (20, 45)) + waves(times, rng, 0.015, (5, 9)) for size in (0.12, 0.08)]
+    return np.stack([*aim, waves(times, rng, 0.07 * depth, (30, 60))], 1)
 
 
-def _waves(times: Array, rng: np.random.Generator, size: float, periods: tuple[float, float]) -> Array:
+def waves(times: Array, rng: np.random.Generator, size: float, periods: tuple[float, float]) -> Array:
     """``(M,)`` up to ``size`` up and down."""
     wave: Array = size * np.sin(2 * math.pi * times / rng.uniform(*periods) + rng.uniform(0, 2 * math.pi))
     return wave

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import trimesh
@@ -27,6 +28,22 @@ _SKIN = np.array([0.62, 0.34, 0.22])  # linear light
 _AWAY = 1.4  # distance of the fingertips from the object's centre in its radii while the hand is away
 _NEARNESS = 0.88  # depth of the hand relative to that of the object's nearest possible point
 _GRID = 30  # pixels per axis with which hidden shares are measured
+
+
+class Occluder(Protocol):
+    """A hand in front of the object."""
+
+    def surface_at(self, time: float) -> RayMesh | None:
+        """Its surface in its own coordinates at a time in frames; None if it is nowhere near."""
+        ...
+
+    def T_cam_hand(self, time: float) -> Array:
+        """Its pose ``(4, 4)`` at a time in frames."""
+        ...
+
+    def albedo(self, points: Array) -> Array:
+        """Linear colours ``(N, 3)`` of points ``(N, 3)`` in its coordinates."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +69,10 @@ class Hand:
     last: int
     scale: float
     reach: float
+
+    def surface_at(self, time: float) -> RayMesh:
+        """See `Occluder.surface_at`: this hand never bends."""
+        return self.surface
 
     def T_cam_hand(self, time: float) -> Array:
         """Pose ``(4, 4)`` at a time in frames."""
@@ -87,7 +108,7 @@ def make_hand(spec: SequenceSpec, path: Path, surface: RayMesh, radius: float, c
     cycles = max(1, round(last / 40))
 
     frames = np.unique(np.linspace(0, last, min(last + 1, 12 * cycles)).round())
-    rays = [_object_rays(surface, T, camera) for T in path.T_cam_obj(frames)]
+    rays = [object_rays(surface, T, camera) for T in path.T_cam_obj(frames)]
 
     def hand(reach: float) -> Hand:
         return Hand(solid, path, radius, angle, cycles, last, scale, reach)
@@ -95,12 +116,15 @@ def make_hand(spec: SequenceSpec, path: Path, surface: RayMesh, radius: float, c
     near, far = -1.3, _AWAY
     for _ in range(10):
         reach = 0.5 * (near + far)
-        hidden = max(_hidden(hand(reach), time, seen) for time, seen in zip(frames, rays, strict=True))
+        tried = hand(reach)
+        hidden = max(
+            hidden_share(solid, tried.T_cam_hand(time), seen) for time, seen in zip(frames, rays, strict=True)
+        )
         near, far = (near, reach) if hidden < MOST_HIDDEN * strength else (reach, far)
     return hand(far)
 
 
-def _object_rays(surface: RayMesh, T_cam_obj: Array, camera: Camera) -> Array:
+def object_rays(surface: RayMesh, T_cam_obj: Array, camera: Camera) -> Array:
     """Directions ``(N, 3)`` of a coarse grid of rays that meet the object."""
     columns, rows = pixels_around(surface.vertices, T_cam_obj, camera)
     step = max(1, round(math.sqrt(len(columns)) / _GRID))
@@ -110,13 +134,13 @@ def _object_rays(surface: RayMesh, T_cam_obj: Array, camera: Camera) -> Array:
     return directions[surface.is_blocked(np.tile(-R.T @ t, (len(directions), 1)), directions @ R)]
 
 
-def _hidden(hand: Hand, time: float, directions: Array) -> float:
-    T = hand.T_cam_hand(time)
-    origin = -T[:3, :3].T @ T[:3, 3]
+def hidden_share(hand: RayMesh, T_cam_hand: Array, directions: Array) -> float:
+    """Share of rays of ``directions`` ``(N, 3)`` from the camera that a hand of a pose ``(4, 4)`` stops."""
+    origin = -T_cam_hand[:3, :3].T @ T_cam_hand[:3, 3]
     if not len(directions):
         return 0.0
     return float(
-        hand.surface.is_blocked(np.tile(origin, (len(directions), 1)), directions @ T[:3, :3]).mean()
+        hand.is_blocked(np.tile(origin, (len(directions), 1)), directions @ T_cam_hand[:3, :3]).mean()
     )
 
 

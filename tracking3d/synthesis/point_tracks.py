@@ -70,10 +70,11 @@ def _in_frame(
     hits = scene.surface.cast(np.tile(origin, (len(ahead), 1)), rays)
     tolerance = _SAME * scene.solid.radius / np.linalg.norm(rays, axis=1)
     seen = ahead[(hits.face >= 0) & (hits.distance > 1 - tolerance)]
-    if scene.hand is not None:
+    surface = scene.hand.surface_at(float(frame)) if scene.hand else None
+    if scene.hand is not None and surface is not None:
         T_hand = scene.hand.T_cam_hand(float(frame))
         start = np.tile(-T_hand[:3, :3].T @ T_hand[:3, 3], (len(seen), 1))
-        over = scene.hand.surface.cast(start, in_camera[seen] @ T_hand[:3, :3])
+        over = surface.cast(start, in_camera[seen] @ T_hand[:3, :3])
         seen = seen[over.distance > 1]
     visible = np.zeros(len(points), bool)
     visible[seen] = True

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tracking3d.synthesis.labels import stick_label
 from tracking3d.synthesis.patches import (
     Array,
     Patch,
@@ -127,9 +128,11 @@ def make_procedural_solid(spec: SequenceSpec) -> Solid:
     else:
         hue = rng.random()
         panels = [paint_plain(rng, PANEL, hue) for _ in patches]
+    if spec.label:
+        panels = stick_label(patches, panels, spec.random("label"))
     vertices, faces, uvs, texture = assemble(patches, [panel.round().astype(np.uint8) for panel in panels])
     symmetries, axis = np.eye(4)[None], None
-    plain = not spec.textured or spec.print_strength == 0
+    plain = (not spec.textured and not spec.label) or spec.print_strength == 0
     if plain and spec.object in ("box", "card"):
         symmetries = _turns([np.zeros(3), *(math.pi * np.eye(3))])
     if spec.object == "vase" or (plain and spec.object in ("bottle", "bowl")):

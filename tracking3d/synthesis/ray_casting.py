@@ -56,8 +56,12 @@ class RayMesh:
     intersector: Any
 
     @classmethod
-    def of(cls, mesh: trimesh.Trimesh) -> RayMesh:
+    def of(cls, mesh: trimesh.Trimesh, vertex_normals: Array | None = None) -> RayMesh:
         """Prepare a mesh.
+
+        Args:
+            mesh: The mesh.
+            vertex_normals: ``(V, 3)`` unit normals of a surface without sharp edges, if they are known.
 
         Raises:
             InputError: If the package embreex is not installed.
@@ -72,13 +76,11 @@ class RayMesh:
         a, b, c = vertices[faces].transpose(1, 0, 2)
         area = np.cross(b - a, c - a)
         normals = area / np.linalg.norm(area, axis=1, keepdims=True).clip(1e-300)
-        return cls(
-            vertices,
-            faces,
-            normals,
-            _corner_normals(vertices, faces, area, normals),
-            RayMeshIntersector(mesh),
-        )
+        if vertex_normals is None:
+            corner_normals = _corner_normals(vertices, faces, area, normals)
+        else:
+            corner_normals = vertex_normals[faces]
+        return cls(vertices, faces, normals, corner_normals, RayMeshIntersector(mesh))
 
     def cast(self, origins: Array, directions: Array) -> MeshHits:
         """First hits of rays from ``origins`` along ``directions``, both ``(N, 3)``; both sides of a face count."""

@@ -68,8 +68,8 @@ def build_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
     things = [_block((0, 0), rng.uniform(1.9, 2.6, 2), (floor, table))]
     things += _clutter(rng, table, floor, half, *_behind(spec, path, R_obj_room))
 
-    textures = [_plane(rng, _WALL_TEXELS) for _ in range(6)]
-    textures.append(_plane(rng, _TABLE_TEXELS))
+    textures = [paint_plane(rng, _WALL_TEXELS) for _ in range(6)]
+    textures.append(paint_plane(rng, _TABLE_TEXELS))
     textures += [pyramid(linear(paint_panel(rng, _CLUTTER_TEXELS))) for _ in things[1:]]
     vertices, faces, uvs, looks = [], [], [], []
     count = 0
@@ -142,9 +142,11 @@ def _block(place: tuple[float, float] | Array, half: Array, heights: tuple[float
     return [Patch(patch.vertices + middle, patch.faces, patch.uvs) for patch in sides]
 
 
-def _plane(rng: np.random.Generator, texels: int) -> list[NDArray[np.float32]]:
+def paint_plane(
+    rng: np.random.Generator, texels: int, clutter: tuple[float, float] = (0.4, 2.0)
+) -> list[NDArray[np.float32]]:
     """What is painted on a wall or the table, with the grain of plaster or wood rather than of a sensor."""
-    painted = paint_background(rng, texels, texels, rng.uniform(0.4, 2.0))
+    painted = paint_background(rng, texels, texels, rng.uniform(*clutter))
     return pyramid(linear(cv2.GaussianBlur(painted, (0, 0), texels / 700)))
 
 

@@ -15,14 +15,17 @@ from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.synthesis.backgrounds import make_background
 from tracking3d.synthesis.camera_effects import linear
+from tracking3d.synthesis.grip import make_grip
 from tracking3d.synthesis.mesh_files import load_solid
 from tracking3d.synthesis.motions import Path, make_path
-from tracking3d.synthesis.occluder import Hand, make_hand
+from tracking3d.synthesis.occluder import Occluder, make_hand
+from tracking3d.synthesis.pick_up import PICK_UP, plan_pick_up
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.room import Room, build_room
 from tracking3d.synthesis.solid import Solid, fade_texture
 from tracking3d.synthesis.spec import SequenceSpec
+from tracking3d.synthesis.tabletop import Tabletop, build_tabletop
 
 Array = NDArray[np.float64]
 
@@ -44,6 +47,7 @@ class Scene:
         hand: What moves in front of it.
         texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None if vertices have colours.
         room: What is around the object instead of the background if the camera walks round it, else None.
+        tabletop: The table that the object is taken from instead of the background, else None.
     """
 
     spec: SequenceSpec
@@ -53,9 +57,10 @@ class Scene:
     surface: RayMesh
     path: Path
     background: NDArray[np.float32]
-    hand: Hand | None
+    hand: Occluder | None
     texture: NDArray[np.float32] | None
     room: Room | None
+    tabletop: Tabletop | None = None
 
     @property
     def T_cam_obj(self) -> Array:
@@ -72,11 +77,18 @@ def make_scene(spec: SequenceSpec) -> Scene:
     camera = Camera.from_fov(*spec.size, spec.fov, origin="synthetic")
     solid = make_solid(spec)
     surface = RayMesh.of(solid.mesh())
+    background = linear(make_background(spec))
+    told = _given_camera(spec, camera)
+    if spec.motion == PICK_UP:
+        path, handling = plan_pick_up(spec, solid, camera)
+        grip = make_grip(spec, handling, path, surface, camera)
+        tabletop = build_tabletop(spec, solid, path, camera)
+        # Inside outlines there is one ray a pixel.
+        texture = _resolved_texture(solid, camera, path, 1)
+        return Scene(spec, camera, told, solid, surface, path, background, grip, texture, None, tabletop)
     path = make_path(spec, camera, solid.radius)
     hand = make_hand(spec, path, surface, solid.radius, camera)
-    background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
-    told = _given_camera(spec, camera)
     room = build_room(spec, solid, path)
     return Scene(spec, camera, told, solid, surface, path, background, hand, texture, room)
 

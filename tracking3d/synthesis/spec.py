@@ -21,9 +21,23 @@ Strength = Annotated[float, Field(ge=0, le=1)]
 """0 is off, 1 is strongest."""
 
 Motion = Literal[
-    "tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return", "walk_round"
+    "tumble",
+    "turntable",
+    "turn_and_back",
+    "flip",
+    "fast",
+    "depth_drift",
+    "leave_and_return",
+    "walk_round",
+    "pick_up",
 ]
-"""See `tracking3d.synthesis.motions`; at ``walk_round`` the camera moves, round a still object in a room."""
+"""See `tracking3d.synthesis.motions`; at ``walk_round`` the camera moves, round a still object in a room.
+
+At ``pick_up``, see `tracking3d.synthesis.pick_up`, a hand takes the object from a table.
+"""
+
+OWN_BACKGROUND = ("walk_round", "pick_up")
+"""Motions whose background is part of the scene: a room or a table."""
 
 PROCEDURAL_BACKGROUND = "procedural"
 
@@ -41,7 +55,8 @@ class Disturbances(Section):
     )
     low_contrast: Strength = Field(0.0, description="Grey levels shrink towards the mean, at 1 to a fifth.")
     occluder: Strength = Field(
-        0.0, description="A hand moves over the object; at 1 it hides up to 35 % of it."
+        0.0,
+        description="A hand moves over the object, or holds it with `pick_up`; at 1 it hides up to 35 % of it.",
     )
     wrong_fov: Strength = Field(
         0.0,
@@ -64,8 +79,19 @@ class SequenceSpec(Section):
         le=1,
         description="Contrast of the print against its mean colour; 0 is that colour alone.",
     )
+    label: bool = Field(
+        False, description="One small printed label on a procedural object that is plain otherwise."
+    )
     motion: Motion = Field("tumble", description="Motion of the object.")
-    degrees_per_frame: float = Field(4.0, ge=0, le=60, description="Speed of rotation; the peak for `fast`.")
+    degrees_per_frame: float = Field(
+        4.0,
+        ge=0,
+        le=60,
+        description="Speed of rotation; the peak for `fast`, the mean while it turns for `pick_up`.",
+    )
+    still_frames: int = Field(
+        8, ge=0, le=10_000, description="Frames before the hand comes, at most half; only with `pick_up`."
+    )
     frames: int = Field(40, ge=1, le=10_000, description="Number of frames.")
     size: tuple[int, int] = Field((320, 240), description="Width and height in pixels.")
     fov: float = Field(45.0, ge=5, le=100, description="True vertical field of view in degrees.")
@@ -110,14 +136,17 @@ class SequenceSpec(Section):
 
     @model_validator(mode="after")
     def _a_room_has_walls_of_its_own(self) -> SequenceSpec:
-        if self.motion == "walk_round" and self.background != PROCEDURAL_BACKGROUND:
-            raise ValueError("walk_round has its own room as background; leave background out")
+        if self.motion in OWN_BACKGROUND and self.background != PROCEDURAL_BACKGROUND:
+            own = "room" if self.motion == "walk_round" else "table"
+            raise ValueError(f"{self.motion} has its own {own} as background; leave background out")
         return self
 
     @model_validator(mode="after")
     def _blur_has_rays_to_average(self) -> SequenceSpec:
         if self.disturbances.motion_blur > 0 and self.supersample == 1:
             raise ValueError("motion_blur needs a supersample of at least 3: it averages the rays of a pixel")
+        if self.disturbances.motion_blur > 0 and self.motion == "pick_up":
+            raise ValueError("pick_up is rendered without motion_blur; leave it out")
         return self
 
     def random(self, purpose: str) -> np.random.Generator:

@@ -18,27 +18,38 @@ from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.synthesis.fresh import FRESH, fresh_suite, seed_of
+from tracking3d.synthesis.phone import PHONE, phone_seed, phone_suite
 from tracking3d.synthesis.spec import SequenceSpec, check_spec
 from tracking3d.synthesis.writing import SUITE_VERSION, is_complete, write_sequence
 
-__all__ = ["SUITES", "SUITE_VERSION", "load_suite", "make_suite"]
+__all__ = ["SEEDED", "SUITES", "SUITE_VERSION", "is_suite", "load_suite", "make_suite"]
 
 SUITES = ("smoke", "standard", "hard", "full")
 """The fixed suites by name, in order of size."""
 
+SEEDED = (FRESH, PHONE)
+"""The suites that are generated from a seed."""
+
+
+def is_suite(name: str) -> bool:
+    """Whether `load_suite` knows a suite of this name, or would if it had a seed."""
+    return name in (*SUITES, *SEEDED) or seed_of(name) is not None or phone_seed(name) is not None
+
 
 def load_suite(name: str) -> list[SequenceSpec]:
-    """The sequences of a suite: one of `SUITES`, or ``fresh-SEED``.
+    """The sequences of a suite: one of `SUITES`, or ``fresh-SEED`` or ``phone-SEED``.
 
     Raises:
         InputError: If there is no such suite.
     """
     if (seed := seed_of(name)) is not None:
         return fresh_suite(seed)
-    if name == FRESH:
-        raise InputError(f"The suite {FRESH} is generated from a seed; give --seed N, or the name {FRESH}-N.")
+    if (seed := phone_seed(name)) is not None:
+        return phone_suite(seed)
+    if name in SEEDED:
+        raise InputError(f"The suite {name} is generated from a seed; give --seed N, or the name {name}-N.")
     if name not in SUITES:
-        known = (*SUITES, FRESH)
+        known = (*SUITES, *SEEDED)
         raise InputError(f"There is no suite '{name}'; {hint(name, known)}")
     with resources.as_file(resources.files("tracking3d.synthesis") / "suites" / f"{name}.yaml") as file:
         document = read_mapping(file)

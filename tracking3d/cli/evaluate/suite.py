@@ -17,11 +17,13 @@ def suite(
         str,
         typer.Argument(
             metavar="NAME",
-            help="Dataset: smoke, standard, hard, full or fresh (synthetic), real, the name of a dataset layout, or a "
-            "YAML file with one.",
+            help="Dataset: smoke, standard, hard, full, fresh or phone (synthetic), real, the name of a dataset "
+            "layout, or a YAML file with one.",
         ),
     ],
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Random seed of the suite 'fresh'.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Random seed of the suites 'fresh' and 'phone'.")
+    ] = None,
     count: Count = None,
     meshes: Meshes = None,
     data: Data = None,
