@@ -45,6 +45,8 @@ ONLINE_FLOORS = [
     {"atlas"},
     {"first_estimates", "frame_tracker"},
     {"continued_refinement"},
+    {"frame_mapping"},
+    {"map_extension"},
     {"user_guidance"},
     {"solver"},
     {"known_object"},

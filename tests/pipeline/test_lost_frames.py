@@ -58,7 +58,8 @@ def test_frames_that_were_skipped_are_no_part_of_a_gap():
 def tracked_from(start: int) -> tuple[Session, dict[int, np.ndarray], dict[int, float]]:
     """A session after its last frame, and what another start comes to."""
     clip = turning()
-    session = Session(settings("tracker.name=masks"), make_prompt(mask=clip.masks[0]))
+    first = Frame(0, clip.images[0])
+    session = Session(settings("crop.size=64", "object.frequency=5"), make_prompt(first, mask=clip.masks[0]))
     for index, image in enumerate(clip.images):
         session.step(Frame(index, image))
     order = [*range(start, FRAMES), *range(start - 1, -1, -1)]
@@ -67,3 +68,92 @@ def tracked_from(start: int) -> tuple[Session, dict[int, np.ndarray], dict[int, 
     assert attempt is not None
     session.adopt(attempt)
     return session, attempt.poses, attempt.confidence
+
+
+def test_another_start_estimates_every_frame_both_ways_and_is_refined_in_order_of_time():
+    session, poses, confidence = tracked_from(6)
+    clip = turning()
+    assert sorted(poses) == sorted(confidence) == list(range(FRAMES))
+    assert rotation_errors(poses).max() < 8
+    session.refine()
+    refined = {}
+    for index, image in enumerate(clip.images):
+        mask = MaskEstimate(clip.masks[index].astype(np.float32))
+        refined[index] = session.refine_frame(Frame(index, image), mask, poses[index]).T_cam_obj
+    assert rotation_errors(refined).max() < 5
+
+
+def rotation_errors(poses) -> np.ndarray:
+    found = np.stack([poses[index][:3, :3] for index in range(FRAMES)])
+    return aligned_rotation_errors(found, turning().T_cam_obj[:, :3, :3])
+
+
+@pytest.fixture
+def video(tmp_path):
+    """A folder of images."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for index, image in enumerate(turning().images):
+        write_image(folder / f"{index:06d}.png", image)
+    return folder
+
+
+def lose(monkeypatch, frames) -> None:
+    """The solver loses the object in these frames while they come causally, and finds it in the next one."""
+    step = OnlineSolver.step
+
+    def losing(self, state, frame, mask):
+        after, estimate = step(self, state, frame, mask)
+        if frame.index not in frames:
+            return after, estimate
+        state = replace(state, last_pose=(state.last_pose[0], frame.index), grey=after.grey)
+        return state, replace(estimate, status=Status.LOST, reason="lost for this test", confidence=0.05)
+
+    monkeypatch.setattr(OnlineSolver, "step", losing)
+
+
+def run(video, folder) -> RunReader:
+    record(
+        open_source(str(video)),
+        settings("crop.size=64", "object.frequency=5"),
+        folder,
+        mask=turning().masks[0],
+    )
+    return RunReader(folder)
+
+
+def test_frames_that_were_lost_are_found_from_both_sides_before_the_refinement(monkeypatch, tmp_path, video):
+    lose(monkeypatch, {12, 13, 14, 15})
+    given = {}
+    start_from = OnlineSolver.start_from
+    monkeypatch.setattr(
+        OnlineSolver,
+        "start_from",
+        lambda self, state, poses: given.update(poses) or start_from(self, state, poses),
+    )
+    refined = run(video, tmp_path / "run").frames
+    assert {12, 13, 14, 15} <= set(given)
+    assert rotation_errors({one.index: one.T_cam_obj for one in refined}).max() < 8
+
+
+def test_a_run_in_which_hardly_a_frame_was_lost_is_refined_as_it_is(monkeypatch, tmp_path, video):
+    monkeypatch.setattr(lost_frames, "GapTracker", lambda *given: pytest.fail("nothing was lost"))
+    run(video, tmp_path / "run")
+
+
+def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_explains_more(
+    monkeypatch, tmp_path, video, caplog
+):
+    lose(monkeypatch, set(range(4, FRAMES)))
+    monkeypatch.setattr(second_start, "find_start", lambda source, masks: 5)
+    monkeypatch.setattr(Session, "adopt", lambda *given: pytest.fail("it explains fewer"))
+    monkeypatch.setattr(SecondStart, "is_better", False)
+    monkeypatch.setattr(OnlineSolver, "begin_extension", lambda *given: None)
+    with caplog.at_level("INFO"):
+        run(video, tmp_path / "run")
+    assert "A start in frame 5 explains" in caplog.text
+
+
+@pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])
+def test_a_second_start_must_explain_clearly_more(explained, better):
+    assert SecondStart(4, explained, 10).is_better is better

@@ -239,7 +239,8 @@ class ObjectRecorder:
         estimates = self._writer.begin_refinement(self._causal_model)
         if self._continue_earlier(estimates):
             return estimates
-        explain_lost_frames(self._session, source, SavedMasks(estimates, self._initial))
+        masks = SavedMasks(estimates, self._initial)
+        estimates.start = explain_lost_frames(self._session, source, masks)
         report_progress("refining the map")
         self._session.refine()
         self._state.save(

@@ -113,6 +113,11 @@ class SessionRefinement:
         self._state = self._solver.start_from(self._state, poses)
 
     @property
+    def first_index(self) -> int:
+        """Index of the frame that tracking started with."""
+        return self._presented.first
+
+    @property
     def order_of_time(self) -> bool:
         """Whether all frames were shown to the solver in order of time."""
         return self._presented.last is None

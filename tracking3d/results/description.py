@@ -86,6 +86,19 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class StartOfModel:
+    """Where the model that is refined started.
+
+    Attributes:
+        frame: Index of the frame.
+        reason: Why it started there, in words.
+    """
+
+    frame: int
+    reason: str
+
+
 def refinement(
     state: str,
     reason: str = "",
@@ -94,6 +107,7 @@ def refinement(
     seconds: float = 0.0,
     together: StageTimes | None = None,
     kept: int = 0,
+    start: StartOfModel | None = None,
 ) -> dict[str, Any]:
     """The outcome of a final refinement.
 
@@ -105,10 +119,12 @@ def refinement(
         seconds: Wall time it took.
         together: Times of the global refinement of the map, before the frames.
         kept: Number of refined estimates that are those of the run before its last correction.
+        start: Where the refined model started; None until that is decided.
     """
     return {
         "state": state,
         "reason": reason,
+        "start": None if start is None else asdict(start),
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
         "kept_refined": kept if refined else 0,

@@ -43,6 +43,7 @@ class RefinementWriter(RefinedEstimates):
         pictures: Overlay and crops of the second pass.
         together: Times of the global refinement of the map, before the frames.
         kept: Number of estimates that are those of an earlier refinement.
+        start: Where the refined model started; None until that is decided.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -61,6 +62,7 @@ class RefinementWriter(RefinedEstimates):
         self._started = time.monotonic() - seconds
         self._taken_over = False
         self.together, self.kept = StageTimes(), 0
+        self.start: description.StartOfModel | None = None
         self.pictures = Pictures(aside / layout.OVERLAY, camera, fps)
         with writing(aside):
             (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
@@ -196,7 +198,9 @@ class RefinementWriter(RefinedEstimates):
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
-        return description.refinement(state, reason, causal, refined, self.seconds, self.together, self.kept)
+        return description.refinement(
+            state, reason, causal, refined, self.seconds, self.together, self.kept, self.start
+        )
 
 
 def adjusted_record(

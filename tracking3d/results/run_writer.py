@@ -195,6 +195,8 @@ class RunWriter:
                 self._lines.truncate()
         causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
         self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal, kept, seconds)
+        if model is None and (before := (self._description["refinement"] or {}).get("start")):
+            self._refinement.start = description.StartOfModel(**before)
         self._description["refinement"] = self._refinement.describe("running")
         self._write_description()
         return self._refinement
@@ -203,6 +205,8 @@ class RunWriter:
         """From here on estimates are those of ``camera``; ``run.json`` names it when the refinement has ended."""
         assert self._refinement is not None
         self._camera = self._refinement.pictures.camera = camera
+        self._description["refinement"] = self._refinement.describe("running")
+        self._write_description()
 
     def use_camera(self, camera: Camera) -> None:
         """From here on causal estimates are those of ``camera``."""

@@ -11,8 +11,8 @@ from online_runs import FRAMES, Run, estimate_of, frame, run, solver, true_mask,
 
 from tracking3d.estimation.gap import Gap
 from tracking3d.estimation.online.atlas.atlas import with_lens_of
-from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
 from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.geometry.pose import rotation_angle

@@ -33,7 +33,7 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
     if view.mask is None or (inliers < ENOUGH_POINTS and fit.overlap < _MIN_OVERLAP):
         return False
     keyframes = object_map.keyframes
-    if (inliers < _FEW_INLIERS or found.doubtful) and view.index >= keyframes[-1].index + _MIN_INTERVAL:
+    if inliers < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
         return True
     angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
     return bool(np.degrees(min(angles)) > config.keyframe_rotation)
