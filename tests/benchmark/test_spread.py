@@ -112,6 +112,24 @@ def test_patterns_choose_variants_and_what_is_compared_with_stays(monkeypatch, t
         run_spread(BASE, dataset, tmp_path, ["Zen"])
 
 
+@pytest.mark.usefixtures("kernels")
+def test_a_variant_that_means_nothing_for_any_sequence_is_left_out(monkeypatch, tmp_path):
+    def run_suite(variants, *rest):
+        return [
+            result(one.label, box=(1.0, 0.9, 0.0))
+            if one.label == UNCHANGED
+            else ResultSet(one.label, "smoke", {}, {}, {})
+            for one in variants
+        ]
+
+    monkeypatch.setattr(spread, "run_suite", run_suite)
+    results, left_out = run_spread(
+        BASE, Dataset("smoke", 1, "clip", tmp_path, ("box",)), tmp_path, ["renderer*"]
+    )
+    assert [one.label for one in results] == [UNCHANGED]
+    assert left_out == {"renderer torch": "it means nothing for these sequences"}
+
+
 def test_every_variant_has_runs_of_its_own(clips, tmp_path):
     def run_key(**change):
         return Job("clip", clips, "narrow", BASE.model_copy(update=change), tmp_path).run_key

@@ -117,7 +117,10 @@ def run_spread(
     # Some kernels end a process only when it comes to an operation that this processor has not.
     for one in results[1:]:
         if not any(one.scores.values()):
-            left_out[one.label] = f"every run failed: {next(iter(one.errors.values()))}"
+            why = next(iter(one.errors.values()), None)
+            left_out[one.label] = (
+                f"every run failed: {why}" if why else "it means nothing for these sequences"
+            )
     return [one for one in results if one.label not in left_out], left_out
 
 
