@@ -130,7 +130,7 @@ def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(ask
 
 def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):
     """A hand that comes, or light, changes the pixels of a thing that stands on a table."""
-    monkeypatch.setattr(initializer, "_has_changed", lambda views: True)
+    monkeypatch.setattr(initializer, "_last_still_view", lambda views: 0)
     state, start = try_initialize(belief_of([0.0] * 41), CONFIG)
     assert start is None
     assert not asked["turning"]

@@ -71,6 +71,6 @@ class FrameMapping(ContinuedRefinement):
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated
         estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
-        if not found.lost:
+        if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         return updated, replace(estimate, keyframe=is_keyframe)

@@ -45,6 +45,7 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     is_fully_visible,
     is_reliable,
     masks_overlap,
+    needs_second_map,
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.first_estimates import estimate_pending_frames
@@ -137,8 +138,7 @@ class OnlineSolver(MapExtension):
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
         state, estimate = self._track(state, frame, image, binary)
-        can_reinitialize = not state.object_map.fixed_keyframes and not state.object_map.pointless
-        if state.phase is SolverPhase.LOST and binary is not None and can_reinitialize:
+        if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)
         return state, mark_unaligned(estimate) if state.unaligned else estimate
 
@@ -267,7 +267,8 @@ class OnlineSolver(MapExtension):
             mask: ``(H, W)`` its initial mask.
         """
         image = grey(frame.image)
-        for other in state.inactive_maps if should_retry(state.lost_frames) else ():
+        searched = state.phase is SolverPhase.LOST and should_retry(state.lost_frames)
+        for other in state.inactive_maps if searched else ():
             updated, found = self._track(activate_map(state, other, frame.index), frame, image, mask)
             if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
                 return updated, found
@@ -286,4 +287,8 @@ class OnlineSolver(MapExtension):
             return replace(state, reinitialization=None), estimate
         state = with_lens_of(state, begun)
         similarity = guess_alignment(state, begun)
-        return switch_map(state, begun, similarity), transform_estimates(again, similarity, state.camera)
+        switched = switch_map(state, begun, similarity)
+        again = transform_estimates(again, similarity, state.camera)
+        if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
+            return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
+        return switched, mark_unaligned(again)

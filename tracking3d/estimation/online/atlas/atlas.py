@@ -134,11 +134,13 @@ def transform_estimates(estimate: FrameEstimate, similarity: Similarity, camera:
     """An estimate of a second initialization in the coordinates of the lost object."""
     T = similarity.poses(estimate.T_cam_obj[None].astype(np.float64))[0].astype(estimate.T_cam_obj.dtype)
     revised = tuple(transform_estimates(one, similarity, camera) for one in estimate.revised)
-    return mark_unaligned(replace(estimate, T_cam_obj=T, camera=camera, revised=revised))
+    return replace(estimate, T_cam_obj=T, camera=camera, revised=revised)
 
 
 def mark_unaligned(estimate: FrameEstimate) -> FrameEstimate:
     """An estimate against a map whose transform to the first one is a guess: lost, however good its mask is."""
+    if estimate.revised:
+        estimate = replace(estimate, revised=tuple(map(mark_unaligned, estimate.revised)))
     if estimate.status is Status.LOST:
         return estimate
     return replace(

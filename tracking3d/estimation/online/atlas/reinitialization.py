@@ -7,13 +7,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
 from tracking3d.estimation.online.state.confidence import BELIEVED
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.frames import Frame
 from tracking3d.segmentation import as_lab
 
+_LASTING_DOUBT = 20  # doubtful frames in a row from which a map without points is doubted itself
 _MIN_MASK_IOU = 0.3  # IoU of two frames' masks, below which they show different objects
 _MIN_COLOUR_RATIO = -0.5  # mean log ratio of the colours, below which a mask shows another object
+
+
+def needs_second_map(state: SolverState, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> bool:
+    """Whether a second map is begun, or continued, after a frame.
+
+    It is if the object is lost. A map without points is given up if its poses have been doubtful for long, too, but
+    only if there is texture now: another map without points would be no better.
+
+    Args:
+        state: After the frame.
+        image: ``(H, W)`` grey.
+        mask: ``(H, W)`` of the object.
+    """
+    if state.object_map.fixed_keyframes:
+        return False
+    if not state.object_map.pointless:
+        return state.phase is SolverPhase.LOST
+    doubted = state.phase is SolverPhase.LOST or state.doubtful_frames >= _LASTING_DOUBT
+    return doubted and texture_strength(image, mask) >= PLAIN
 
 
 def masks_overlap(before: NDArray[np.bool_] | None, mask: NDArray[np.bool_]) -> bool:

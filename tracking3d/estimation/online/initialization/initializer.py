@@ -16,6 +16,7 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.features.sift import detect, match
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
+from tracking3d.estimation.online.initialization.image_change import image_change
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     initialize_without_points,
@@ -46,6 +47,8 @@ _SAME_PLACE = 1.5  # pixels
 _MATCHED_FRAMES = 3  # earlier frames that each frame is matched with
 _MAX_MASK_GAP = 3  # frames; a mask tracker may miss the object for so long
 _NOISE_FACTOR = 1.3  # times the change between neighbouring frames, below which a change is noise
+_LONG_STILL = 6  # frames without a change, from which they are left out of a start without points
+_MIN_OUTLINE_CHANGE, _MIN_SHADING_CHANGE = 0.05, 0.004  # see `ImageChange`; the least that is no noise
 # Log ratio of two costs, times the deformation, from which the better hypothesis is accepted; and the same if it is
 # the better one for the second time.
 _MIN_LEAD, _MIN_LEAD_AGAIN = 0.04, 0.02
@@ -126,7 +129,7 @@ def try_initialize(
         )
         if not enough and not ended:
             return state, None
-        return _start_without_points(state, views, config)
+        return _start_of_plain_object(state, views, config, ended)
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
     motion = image_deformation(tracks_of(views, names[~state.object_map.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
@@ -175,12 +178,25 @@ def _starts_from_points(state: SolverState, views: list[Keyframe], config: Onlin
     return solve_start(state.object_map, lens_hypotheses(state.camera), views, weights, config.surface_prior)
 
 
+def _start_of_plain_object(
+    state: SolverState, views: list[Keyframe], config: OnlineConfig, ended: bool
+) -> tuple[SolverState, InitialMap | None]:
+    """The initial map of an object without texture, from the frames since it began to turn."""
+    last_still = _last_still_view(views)
+    if last_still is not None and last_still >= _LONG_STILL:
+        views = views[last_still:]
+        if len(views) < _MIN_FRAMES_WITHOUT_POINTS and not ended:
+            kept = tuple(one for one in state.pending or () if one[0].index >= views[0].index)
+            return replace(state, pending=kept, waiting_reason="", ambiguous_frames=0), None
+    return _start_without_points(state, views, config)
+
+
 def _start_without_points(
     state: SolverState, views: list[Keyframe], config: OnlineConfig
 ) -> tuple[SolverState, InitialMap | None]:
     """The initial map from pixels and outlines alone; None if nothing shows that the object rotates."""
     waiting = state.pending or ()
-    if not _has_changed(views):
+    if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= _MAX_PENDING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
     return state, initialize_without_points(
@@ -225,17 +241,23 @@ def _is_gone(views: Sequence[Keyframe]) -> bool:
     return len(views) > _MAX_MASK_GAP and all(view.mask is None for view in views[-_MAX_MASK_GAP:])
 
 
-def _has_changed(views: list[Keyframe]) -> bool:
-    """Whether the object's appearance inside both masks has changed by more than between neighbouring frames."""
+def _last_still_view(views: list[Keyframe]) -> int | None:
+    """The place of the last view in which the object looks as in the first one; None if it still does in the last.
 
-    def difference(a: Keyframe, b: Keyframe) -> float:
-        both = (a.observation.mask * b.observation.mask) > 0.5
-        if not bool(both.any()):
-            return 0.0
-        return float((a.observation.features - b.observation.features)[:, both].abs().mean())
+    Apart from a similarity of the image, which is the camera's motion in a hand.
+    """
+    near = [image_change(a.observation, b.observation) for a, b in pairwise(views)]
+    outline = max(_MIN_OUTLINE_CHANGE, _NOISE_FACTOR * float(np.median([one.outline for one in near])))
+    shading = _MIN_SHADING_CHANGE + _NOISE_FACTOR * float(np.median([one.shading for one in near]))
 
-    neighbours = [difference(a, b) for a, b in pairwise(views)]
-    return difference(views[0], views[-1]) > _NOISE_FACTOR * float(np.median(neighbours))
+    def has_changed(view: Keyframe) -> bool:
+        change = image_change(views[0].observation, view.observation)
+        return change.outline > outline or change.shading > shading
+
+    if not has_changed(views[-1]):
+        return None
+    places = range(len(views) - 2, 0, -1)
+    return next((place for place in places if not has_changed(views[place])), 0)
 
 
 def _recent_frames(
