@@ -21,7 +21,13 @@ from tracking3d.estimation.online.atlas.atlas import (
     refine_inactive_map,
     switch_map,
 )
-from tracking3d.estimation.online.atlas.reinitialization import colours_match, is_fully_visible, masks_overlap
+from tracking3d.estimation.online.atlas.reinitialization import (
+    colours_match,
+    is_fully_visible,
+    masks_overlap,
+    needs_second_map,
+)
+from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
@@ -246,3 +252,53 @@ def test_what_has_the_colours_of_the_surroundings_is_not_the_object():
     wall = np.zeros_like(mask)
     wall[2:20, 2:20] = True
     assert not mask[wall].any() and not colours_match(state, Frame(BACK, image), wall)
+
+
+PLAIN_IMAGE = np.full((180, 240), 120, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change", "lost", "doubtful", "needed"),
+    [
+        ({}, 0, 50, False),
+        ({}, 1, 1, True),
+        ({"fixed_keyframes": 3}, 1, 1, False),
+        ({"pointless": True}, 0, 19, False),
+        ({"pointless": True}, 0, 20, True),
+        ({"pointless": True}, 1, 1, True),
+    ],
+)
+def test_a_second_map_is_begun_if_the_object_is_lost_or_a_map_without_points_is_doubted_for_long(
+    change, lost, doubtful, needed
+):
+    state, _ = run(FIRST)
+    state = replace(
+        state, object_map=replace(state.object_map, **change), lost_frames=lost, doubtful_frames=doubtful
+    )
+    frame, mask = shown(FIRST - 1)
+    assert needs_second_map(state, grey(frame.image), mask) is needed
+
+
+def test_a_map_without_points_is_not_followed_by_another_one():
+    state, _ = run(FIRST)
+    state = replace(state, object_map=replace(state.object_map, pointless=True), doubtful_frames=99)
+    assert not needs_second_map(state, PLAIN_IMAGE, shown(FIRST - 1)[1])
+
+
+def test_a_map_without_points_gives_way_to_one_with_points():
+    """Its frames were doubted all the time: nothing is held to it, and what follows is no guess."""
+    state, _ = run(FIRST)
+    nothing = replace(state.object_map, pointless=True, keyframes=state.object_map.keyframes[:2])
+    state = replace(state, object_map=nothing, lost_frames=3, doubtful_frames=30)
+    estimates = []
+    for index in range(BACK, BACK + 20):
+        frame, mask = shown(index)
+        state, estimate = solver().step(state, frame, estimate_of(mask))
+        estimates.append(estimate)
+        if not state.object_map.pointless:
+            break
+    assert not state.object_map.pointless
+    assert not state.unaligned
+    assert state.inactive_maps == ()
+    assert estimates[-1].status is Status.TRACKED
+    assert all(one.status is not Status.LOST for one in estimates[-1].revised)
