@@ -15,6 +15,7 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.evaluation.alignment import align_object_frame
 from tracking3d.points import landmark_adjustment
 from tracking3d.points.track_chaining import Chain
+from tracking3d.reconstruction import global_adjustment
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.results.records import FrameRecord
 
@@ -218,3 +219,20 @@ def test_a_run_that_is_the_other_way_round_is_turned_also_where_frames_were_not_
     assert rotation_errors(wrong).mean() > 10
     _, found = settled(wrong, 5)
     assert rotation_errors(found).max() < 2
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_depth_is_reversed_only_on_evidence_of_a_texture(monkeypatch, textured):
+    """Corners on a plain surface are noise: they turned a plain object round that was right until then."""
+    asked = []
+    refine_scene = global_adjustment.refine_scene
+
+    def refine(scene, rounds, **given):
+        asked.append(scene.may_reverse)
+        return refine_scene(scene, rounds, **given)
+
+    monkeypatch.setattr(global_adjustment, "refine_scene", refine)
+    if not textured:
+        monkeypatch.setattr(global_adjustment, "texture_strength", lambda image, mask: 0.1)
+    settled(disturbed())
+    assert asked == [textured]

@@ -86,7 +86,8 @@ class GlobalAdjustment:
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
         scene = refine_scene(
-            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
+            # Corners that are found on a plain surface are no evidence against the sense of its rotation.
+            LandmarkScene(views, self.vertices, self.faces, may_reverse=self._is_textured),
             int(np.clip(_DRAWN // len(views), *ROUNDS)),
             free_focal=self.camera.assumed,
         )
@@ -143,7 +144,12 @@ class GlobalAdjustment:
 
     def _told(self, support: LandmarkSupport | None) -> LandmarkSupport | None:
         """What landmarks say, with whether they can tell anything on this object."""
-        return support and replace(support, telling=float(np.median(self._strengths)) >= PLAIN)
+        return support and replace(support, telling=self._is_textured)
+
+    @property
+    def _is_textured(self) -> bool:
+        """Whether landmarks can tell anything on this object."""
+        return float(np.median(self._strengths)) >= PLAIN
 
     def _between(self, index: int, before: int, after: int) -> _Pose:
         """The pose of a frame in which the object was not found: it goes on steadily from one view to the next."""
