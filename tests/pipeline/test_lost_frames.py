@@ -157,3 +157,17 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
 @pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])
 def test_a_second_start_must_explain_clearly_more(explained, better):
     assert SecondStart(4, explained, 10).is_better is better
+
+
+def test_run_json_says_where_the_refined_model_started_and_why(monkeypatch, tmp_path, video):
+    first = run(video, tmp_path / "first").description["refinement"]["start"]
+    assert first == {"frame": 0, "reason": "tracking began in this frame"}
+    lose(monkeypatch, set(range(4, FRAMES)))
+    monkeypatch.setattr(second_start, "find_start", lambda source, masks: 5)
+    monkeypatch.setattr(SecondStart, "is_better", True)
+    monkeypatch.setattr(OnlineSolver, "begin_extension", lambda *given: None)
+    second = run(video, tmp_path / "second")
+    start = second.description["refinement"]["start"]
+    assert start["frame"] == 5
+    assert f"of {FRAMES} frames, one in frame 0 explains" in start["reason"]
+    assert [one.index for one in second.frames] == list(range(FRAMES))

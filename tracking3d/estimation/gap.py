@@ -1,4 +1,4 @@
-"""Frames that a solver is to track the object through, from a keyframe beside them."""
+"""Frames that a solver is to track the object through, from a keyframe next to them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tracking3d.frames import Frame, MaskEstimate
 
 
 @dataclass(frozen=True)
-class Explained:
-    """What a model explains of a video.
+class ModelCoverage:
+    """The part of a video that a model explains.
 
     Attributes:
         confidence: Of each frame that was estimated with it, by index.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
-from tracking3d.estimation.gap import Explained, Gap
+from tracking3d.estimation.gap import Gap, ModelCoverage
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.shape import Shape
@@ -100,7 +100,7 @@ class ExtendingSolver(Protocol, Generic[State]):
 
     def begin_extension(
         self, state: State, confidence: Mapping[int, float]
-    ) -> tuple[State, Explained] | None:
+    ) -> tuple[State, ModelCoverage] | None:
         """The state for ``extend``, and what the model explains; None if there is nothing to start from.
 
         Args:
@@ -110,7 +110,7 @@ class ExtendingSolver(Protocol, Generic[State]):
         ...
 
     def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
-        """Track the object through a gap, and learn from it; the gap's anchor is one of ``Explained.anchors``."""
+        """Track the object through a gap, and learn from it; the gap's anchor is one of ``ModelCoverage.anchors``."""
         ...
 
     def end_extension(self, state: State, found: Collection[int], last: int) -> State:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
-from tracking3d.estimation.gap import Explained, Gap
+from tracking3d.estimation.gap import Gap, ModelCoverage
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.solver import (
     ContinuingSolver,
@@ -114,11 +114,11 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
 
     def begin_extension(
         self, state: State, confidence: Mapping[int, float]
-    ) -> tuple[State, Explained] | None:
+    ) -> tuple[State, ModelCoverage] | None:
         """See `ExtendingSolver.begin_extension`."""
         if not isinstance(self._solver, ExtendingSolver):
             return None
-        begun: tuple[State, Explained] | None = self._solver.begin_extension(state, confidence)
+        begun: tuple[State, ModelCoverage] | None = self._solver.begin_extension(state, confidence)
         return begun
 
     def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from tracking3d.checkpoint.progress import check_picture
 from tracking3d.checkpoint.run_state import RunState
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.frames import Frame
 from tracking3d.pipeline.earlier_refinement import EarlierRefinement
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import (
@@ -22,6 +21,7 @@ from tracking3d.pipeline.refinement_steps import (
     RefinementSteps,
     estimate_again,
 )
+from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.reconstruction import BELIEVED, TextureView, keep_best_views, texture_view
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.reconstruction.held_adjustment import HeldAdjustment
@@ -44,7 +44,7 @@ class FinalRefinement:
         estimates: Writes the refined estimates.
         state: How far the run is.
         work: Writes in another thread while the next frame is solved.
-        initial: Score and reason of every frame's initial mask, by index.
+        masks: The initial masks.
         precomputed: What the last steps come to, if other processes have taken them.
         earlier: The estimates that stand, if only some frames are refined.
     """
@@ -56,12 +56,12 @@ class FinalRefinement:
         estimates: RefinementWriter,
         state: RunState,
         work: BackgroundWriter,
-        initial: Mapping[int, tuple[float, str]],
+        masks: SavedMasks,
         precomputed: PrecomputedRefinement | None = None,
         earlier: EarlierRefinement | None = None,
     ) -> None:
         self._session, self._writer, self._estimates = tracked.session, writer, estimates
-        self._state, self._work, self._initial = state, work, initial
+        self._state, self._work, self._masks = state, work, masks
         self._views: tuple[TextureView, ...] = ()
         self._precomputed, self._earlier = precomputed, earlier
         wanted, camera = self._session.config.object, self._session.camera
@@ -90,8 +90,7 @@ class FinalRefinement:
                 record = estimates.estimate(frame.index)
                 return self._work.do(partial(self._collect, record, frame, estimates.mask(record)))
         mask = estimates.initial_mask(frame.index)
-        score, reason = self._initial.get(frame.index, (1.0, ""))
-        initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
+        initial = self._masks.estimate(frame.index, mask)
         estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial, earlier)
         # A stopped refinement of some frames is begun again.
         kept = self._session.state_dict() if state.checkpoint and earlier is None else {}

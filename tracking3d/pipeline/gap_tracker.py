@@ -71,7 +71,7 @@ class GapTracker:
         return {
             index
             for index in self._frames_taken
-            if self.confidence.get(index, 0.0) < BELIEVED and self._masks.seen(index)
+            if self.confidence.get(index, 0.0) < BELIEVED and self._masks.has_mask(index)
         }
 
     def _sweep(self, *, backwards: bool) -> None:
@@ -82,7 +82,7 @@ class GapTracker:
         with closing(self._frames(backwards)) as frames:
             for frame in frames:
                 if length := gaps.pop(frame.index, 0):
-                    self._extend(Gap(frame, self._masks.added(islice(frames, length)), backwards))
+                    self._extend(Gap(frame, self._masks.with_masks(islice(frames, length)), backwards))
                 if not gaps:
                     return
 

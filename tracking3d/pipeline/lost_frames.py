@@ -33,8 +33,8 @@ def explain_lost_frames(session: Session, source: FrameSource, masks: SavedMasks
         Where the model that is to be refined started.
     """
     causal = masks.estimates.causal
-    first = StartOfModel(session.first_index, "the object is given in this frame")
-    lost = [index for index, one in causal.items() if one.status is Status.LOST and masks.seen(index)]
+    first = StartOfModel(session.first_index, "tracking began in this frame")
+    lost = [index for index, one in causal.items() if one.status is Status.LOST and masks.has_mask(index)]
     if len(lost) < max(1, _MIN_LOST * len(causal)):
         return first
     gaps = GapTracker(session, source, masks)

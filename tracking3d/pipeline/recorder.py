@@ -209,7 +209,7 @@ class ObjectRecorder:
                 estimates,
                 self._state,
                 self._work,
-                self._initial,
+                SavedMasks(estimates, self._initial),
                 self.precomputed,
                 self._earlier,
             )

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results.refined_estimates import RefinedEstimates
@@ -23,16 +24,19 @@ class SavedMasks:
     estimates: RefinedEstimates
     initial: Mapping[int, tuple[float, str]]
 
-    def seen(self, index: int) -> bool:
+    def has_mask(self, index: int) -> bool:
         """Whether the mask tracker saw the object in a frame."""
         return self.estimates.causal[index].iou_initial is not None
 
     def of(self, frame: Frame) -> MaskEstimate:
         """The initial mask of a frame."""
-        mask = self.estimates.initial_mask(frame.index)
-        score, reason = self.initial.get(frame.index, (1.0, ""))
+        return self.estimate(frame.index, self.estimates.initial_mask(frame.index))
+
+    def estimate(self, index: int, mask: NDArray[np.bool_] | None) -> MaskEstimate:
+        """The initial mask ``(H, W)`` of a frame with its score and reason."""
+        score, reason = self.initial.get(index, (1.0, ""))
         return MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
 
-    def added(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, MaskEstimate]]:
+    def with_masks(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, MaskEstimate]]:
         """Frames with their initial masks."""
         return ((frame, self.of(frame)) for frame in frames)

@@ -28,7 +28,7 @@ from tracking3d.video.both_ways import both_ways
 from tracking3d.video.source import FrameSource
 
 _SAMPLED = 2  # every so many frames are looked at for a start
-_MAX_UNEXPLAINED = 0.25  # share of the frames with a mask up to which the first start stays
+_MAX_UNEXPLAINED = 0.25  # share of the frames without a reliable pose up to which the first start stays
 _MIN_GAIN = 1.1  # times as many frames as the first start's must be explained
 
 
@@ -74,7 +74,7 @@ def try_second_start(
     with closing(every) as frames_both_ways:
         wanted = (frame for frame in frames_both_ways if isinstance(frame, Frame))
         attempt = session.attempt(
-            masks.added(frame for frame in wanted if frame.index in masks.estimates.causal)
+            masks.with_masks(frame for frame in wanted if frame.index in masks.estimates.causal)
         )
     if attempt is None:
         return None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed
-from tracking3d.estimation.gap import Explained, Gap
+from tracking3d.estimation.gap import Gap, ModelCoverage
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.solver import (
     ContinuingSolver,
@@ -79,7 +79,7 @@ class SessionRefinement:
         self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
 
-    def begin_extension(self, confidence: Mapping[int, float]) -> Explained | None:
+    def begin_extension(self, confidence: Mapping[int, float]) -> ModelCoverage | None:
         """Prepare to track the object into frames that are not explained; None if the solver cannot.
 
         Args:

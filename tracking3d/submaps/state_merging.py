@@ -13,7 +13,7 @@ from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.atlas.map_merging import match_landmarks, merge, transform_map
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.focal_length import map_through_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
@@ -27,8 +27,7 @@ def through_lens(state: SolverState, camera: Camera) -> SolverState:
     before = state.camera
     if camera == before:
         return state
-    keyframes = tuple(with_focal_length(view, before, camera) for view in state.object_map.keyframes)
-    return replace(state, camera=camera, object_map=replace(state.object_map, keyframes=keyframes))
+    return replace(state, camera=camera, object_map=map_through_lens(state.object_map, before, camera))
 
 
 def in_space(

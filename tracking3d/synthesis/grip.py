@@ -261,7 +261,7 @@ def _touch(hull: RayMesh, R_obj_hand: Array, middle: Array, size: float, overlap
 
     rows = size * np.append(_ROWS, _THUMB_ROW)
     edge = cast(np.column_stack([np.full(5, far), rows, np.zeros(5)]), (-1, 0, 0))
-    edge = np.maximum(edge, edge.max() - 0.3 * size)  # a finger beside the object goes along with the others
+    edge = np.maximum(edge, edge.max() - 0.3 * size)  # a finger next to the object goes along with the others
     lengths = size * overlap * np.append(_LENGTHS, 0.6)
     x = edge[:, None] - np.stack([np.full(5, 0.08 * size), 0.5 * lengths, lengths], 1)
     over = np.column_stack([x[:4].ravel(), np.repeat(rows[:4], 3), np.full(12, far)])

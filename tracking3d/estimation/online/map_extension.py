@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.gap import Explained, Gap
-from tracking3d.estimation.online.atlas.atlas import activate_largest_map, frames_of_map, through_lens
+from tracking3d.estimation.gap import Gap, ModelCoverage
+from tracking3d.estimation.online.atlas.atlas import (
+    activate_largest_map,
+    frames_of_map,
+    inactive_map_through_lens,
+)
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.frame_mapping import FrameMapping
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
@@ -37,7 +41,7 @@ class MapExtension(FrameMapping):
 
     def begin_extension(
         self, state: SolverState, confidence: Mapping[int, float]
-    ) -> tuple[SolverState, Explained] | None:
+    ) -> tuple[SolverState, ModelCoverage] | None:
         """The state with the largest map active, and what it explains; None if it cannot be extended.
 
         Keyframes that neither an estimate nor enough landmarks support are removed; the others are refined together,
@@ -62,9 +66,11 @@ class MapExtension(FrameMapping):
             object_map=object_map,
             surface=object_map.surface(),
             reinitialization=None,
-            inactive_maps=tuple(through_lens(other, state.camera, camera) for other in state.inactive_maps),
+            inactive_maps=tuple(
+                inactive_map_through_lens(other, state.camera, camera) for other in state.inactive_maps
+            ),
         )
-        return state, Explained(own, anchors)
+        return state, ModelCoverage(own, anchors)
 
     def extend(self, state: SolverState, gap: Gap) -> tuple[SolverState, list[FrameEstimate]]:
         """Track the object through a gap, and insert keyframes there; no estimates if its keyframe was culled."""

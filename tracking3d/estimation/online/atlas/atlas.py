@@ -17,7 +17,7 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.atlas.map_merging import transform_map, transform_pose
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.focal_length import pose_through_lens, with_focal_length
+from tracking3d.estimation.online.mapping.focal_length import map_through_lens, pose_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
@@ -40,15 +40,14 @@ def with_lens_of(state: SolverState, begun: SolverState) -> SolverState:
     factor = after.fy / before.fy
     if factor == 1:
         return state
-    keyframes = tuple(with_focal_length(view, before, after) for view in state.object_map.keyframes)
-    object_map = replace(state.object_map, keyframes=keyframes)
+    object_map = map_through_lens(state.object_map, before, after)
     return replace(
         state,
         camera=after,
         object_map=object_map,
         surface=object_map.surface(),
         trajectory=tuple((pose_through_lens(pose, factor), index) for pose, index in state.trajectory),
-        inactive_maps=tuple(through_lens(other, before, after) for other in state.inactive_maps),
+        inactive_maps=tuple(inactive_map_through_lens(other, before, after) for other in state.inactive_maps),
     )
 
 
@@ -199,17 +198,16 @@ def refine_inactive_map(
 
     Its transform to the map that the mesh is made from is a guess, whichever of the two was first.
     """
-    other = through_lens(other, before, after)
+    other = inactive_map_through_lens(other, before, after)
     object_map, _ = refine_globally(other.object_map, replace(after, assumed=False), config)
     return replace(other, object_map=object_map, surface=object_map.surface(), unaligned=True)
 
 
-def through_lens(other: InactiveMap, before: Camera, after: Camera) -> InactiveMap:
+def inactive_map_through_lens(other: InactiveMap, before: Camera, after: Camera) -> InactiveMap:
     """An inactive map as seen with another focal length."""
     if after == before:
         return other
-    keyframes = tuple(with_focal_length(view, before, after) for view in other.object_map.keyframes)
-    return replace(other, object_map=replace(other.object_map, keyframes=keyframes))
+    return replace(other, object_map=map_through_lens(other.object_map, before, after))
 
 
 def _with_active_map(

@@ -57,6 +57,12 @@ def pose_through_lens(pose: Pose, factor: float) -> Pose:
     return Pose(torch.stack([x, y, factor * z], -1), pose.quaternion)
 
 
+def map_through_lens(object_map: ObjectMap, before: Camera, after: Camera) -> ObjectMap:
+    """A map as seen with another focal length: depths scale with it, the object keeps its size."""
+    keyframes = tuple(with_focal_length(view, before, after) for view in object_map.keyframes)
+    return replace(object_map, keyframes=keyframes)
+
+
 def lens_change(factor: float) -> float:
     """How far two focal lengths are apart, in [0, 1]: 1 is a factor of two or more."""
     return min(abs(math.log2(factor)), 1.0)
