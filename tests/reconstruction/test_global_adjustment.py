@@ -86,7 +86,7 @@ def test_a_side_that_is_seen_between_the_evenly_spaced_views_has_landmarks_too()
 def test_of_a_faint_texture_too_the_answer_hardly_depends_on_where_it_began(monkeypatch):
     """All turns too small and depth too large, and the reverse: seen from afar both look alike."""
     soft = cv2.GaussianBlur(pattern(), (0, 0), 4)
-    faint = (0.5 + 0.02 * (soft - soft.mean()) / soft.std()).astype(np.float32)
+    faint = (0.5 + 0.05 * (soft - soft.mean()) / soft.std()).astype(np.float32)
     monkeypatch.setattr(f"{__name__}.FRAMES", [seen(T, faint) for T in TRUE])
     ends = []
     for factor in (0.8, 1.25):
@@ -221,18 +221,9 @@ def test_a_run_that_is_the_other_way_round_is_turned_also_where_frames_were_not_
     assert rotation_errors(found).max() < 2
 
 
-@pytest.mark.parametrize("textured", [True, False])
-def test_depth_is_reversed_only_on_evidence_of_a_texture(monkeypatch, textured):
-    """Corners on a plain surface are noise: they turned a plain object round that was right until then."""
-    asked = []
-    refine_scene = global_adjustment.refine_scene
-
-    def refine(scene, rounds, **given):
-        asked.append(scene.may_reverse)
-        return refine_scene(scene, rounds, **given)
-
-    monkeypatch.setattr(global_adjustment, "refine_scene", refine)
-    if not textured:
-        monkeypatch.setattr(global_adjustment, "texture_strength", lambda image, mask: 0.1)
-    settled(disturbed())
-    assert asked == [textured]
+def test_what_corners_say_of_a_plain_object_changes_nothing(monkeypatch):
+    """They are shades and edges, which slide over its surface: poses were better before."""
+    monkeypatch.setattr(global_adjustment, "texture_strength", lambda image, mask: 0.1)
+    given = disturbed()
+    _, found = settled(given)
+    np.testing.assert_allclose(found, given)

@@ -43,8 +43,8 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
 
     A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
-    and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree, and
-    whether the object is plain, adds nothing to the share that does.
+    and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree adds
+    nothing to the share that does. On a plain object landmarks never raise a confidence.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -55,6 +55,8 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     evidence = refined_confidence_features(rendering.confidence, support)
     odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
     confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
+    if not support.telling:  # shades and edges slide over a plain surface, and agree with wrong poses, too
+        confidence = min(confidence, rendering.confidence)
     if confidence >= BELIEVED:
         return Assessment(Status.TRACKED, "", confidence)
     reason = rendering.reason

@@ -78,16 +78,19 @@ class GlobalAdjustment:
                 self._strengths.append(texture_strength(grey(image), mask))
 
     def settle(self) -> None:
-        """Put poses, lens and surface right, as far as the frames say how."""
-        if len(self._views) < _LEAST_VIEWS:
+        """Put poses, lens and surface right, as far as the frames say how.
+
+        Corners that are found on a plain surface are shades and edges, which slide over it: what they say of its poses
+        is worse than what pixels and outlines said before.
+        """
+        if len(self._views) < _LEAST_VIEWS or not self._is_textured:
             return
         self._bundled = sorted(self._views)
         views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
         scene = refine_scene(
-            # Corners that are found on a plain surface are no evidence against the sense of its rotation.
-            LandmarkScene(views, self.vertices, self.faces, may_reverse=self._is_textured),
+            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
             int(np.clip(_DRAWN // len(views), *ROUNDS)),
             free_focal=self.camera.assumed,
         )
@@ -121,7 +124,7 @@ class GlobalAdjustment:
         kept = scene.views[nearest]
         assert kept is not None
         if self._bundled[nearest] == record.index:
-            return kept.T_cam_obj, self._told(scene.support.get(nearest))
+            return kept.T_cam_obj, scene.support.get(nearest)
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         predicted = self._as_settled(record.T_cam_obj) @ T_before_now
@@ -131,7 +134,7 @@ class GlobalAdjustment:
         resected, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, self._told(LandmarkSupport(followed, round(share * followed)))
+        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""
@@ -141,10 +144,6 @@ class GlobalAdjustment:
         """What the texture is taken from, with the pose that its frame has in the end."""
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
-
-    def _told(self, support: LandmarkSupport | None) -> LandmarkSupport | None:
-        """What landmarks say, with whether they can tell anything on this object."""
-        return support and replace(support, telling=self._is_textured)
 
     @property
     def _is_textured(self) -> bool:

@@ -42,6 +42,9 @@ def with_tracks(*tracks, angles=ANGLES):
     )
 
 
+SMALL = [-5.0, -1.0, 3.0, 6.0]  # degrees
+
+
 def rigid(angles=ANGLES):
     return [pixels_of(POINT[None], view)[0] for view in turned_map(angles).keyframes]
 
@@ -147,6 +150,19 @@ def test_candidates_are_corners_beside_the_mask_at_no_known_place(masked):
     # The room for candidates is filled once.
     again, _ = with_candidates(more, shows, speckle())
     assert len(again.landmarks) <= MOST_CANDIDATES
+
+
+def test_next_to_an_object_that_rested_a_point_is_promoted_only_after_it_has_turned(monkeypatch):
+    """On a table everything moves in the image as the object does, while a hand holds the camera."""
+    monkeypatch.setattr(candidate_landmarks, "_MIN_MOTION", 2.0)  # pixels
+    little, much = (
+        replace(with_tracks(rigid(angles), angles=angles), resting=True) for angles in (SMALL, ANGLES)
+    )
+    assert not recruited(replace(little, resting=False)).candidate.any()
+    undecided = recruited(little)
+    assert undecided.candidate.all()
+    assert shown(undecided) == {0}  # it is not dropped: later frames decide
+    assert not recruited(much).candidate.any()
 
 
 def ring(directions) -> list:

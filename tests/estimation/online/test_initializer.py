@@ -128,6 +128,32 @@ def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(ask
     assert not asked["turning"]
 
 
+NUDGE = [0.0] * 6 + [11.0, 15.0]  # degrees
+
+
+@pytest.mark.parametrize(
+    ("angles", "resting", "ended", "started"),
+    [
+        (NUDGE, False, False, True),
+        (NUDGE, True, False, False),
+        (NUDGE, True, True, True),
+        ([*NUDGE, 24.0], True, False, True),
+    ],
+)
+def test_a_nudge_starts_no_object_that_rested_until_then(asked, angles, resting, ended, started):
+    given = belief_of(angles)
+    given = replace(given, object_map=replace(given.object_map, resting=resting))
+    assert (try_initialize(given, CONFIG, ended=ended)[1] is not None) is started
+    assert bool(asked["points"]) is started
+
+
+def test_an_object_that_was_still_for_long_rests_and_one_that_has_gone_does_not(asked):
+    state, _ = try_initialize(belief_of([0.0] * 41), CONFIG)
+    assert state.object_map.resting
+    state, _ = try_initialize(belief_of(STILL), CONFIG)
+    assert not state.object_map.resting
+
+
 def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):
     """A hand that comes, or light, changes the pixels of a thing that stands on a table."""
     monkeypatch.setattr(initializer, "_last_still_view", lambda views: 0)

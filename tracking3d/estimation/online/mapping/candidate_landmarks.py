@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.estimation.online.features.klt import FollowedPoints, new_corners
-from tracking3d.estimation.online.mapping.local_mapping import tracks_of
+from tracking3d.estimation.online.mapping.local_mapping import tracks_of, viewing_angle
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
@@ -30,6 +30,9 @@ _MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
     2.5,
 )  # mean residual in pixels at an object size of 200 pixels
 _MIN_MOTION = 6.0  # such pixels
+_MIN_ROTATION = 12.0
+"""Degrees by which an object that rested at first must have been seen to turn while a candidate was tracked: a thing on
+a table turns less, if a hand touches it or the camera moves in a hand, and then the table fits as well as it does."""
 _MAX_STATIC_MOTION = 0.3  # share of the motion that the object would have caused
 _SECTORS = 8  # directions into which the surroundings are divided
 _STATIC_SHARE = 0.6  # share of a sector's candidates, and of the sectors, that fit if the scene is static
@@ -101,9 +104,12 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
         < 1.6 * object_map.radius
     )
     enough = tracks.visible.sum(0) >= _VIEWS
-    accepted = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
+    fits = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
+    accepted = fits
+    if object_map.resting:
+        accepted = fits & (_rotation_seen(views, tracks.visible, first) > _MIN_ROTATION)
     rejected = stays | (enough & ((residual > _MIN_OUTLIER_RESIDUAL) | ~near) & (motion > _MIN_MOTION))
-    rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
+    rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~fits
     told = enough & (motion > _MIN_MOTION)
     beside = object_map.candidates_around + _by_sector(
         views, first, pixel, told, residual < _MAX_INLIER_RESIDUAL
@@ -125,6 +131,15 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
     return replace(
         object_map, landmarks=landmarks, candidate=candidate, keyframes=keyframes, candidates_around=beside
     )
+
+
+def _rotation_seen(
+    views: list[Keyframe], visible: NDArray[np.bool_], first: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """``(N,)`` degrees by which each candidate has been seen to turn, since the first view that shows it."""
+    angles = np.array([[viewing_angle(a.pose, b.pose) for b in views] for a in views])
+    seen: NDArray[np.float64] = np.where(visible.T, angles[first], 0.0).max(1)
+    return seen
 
 
 def is_static_scene(beside: NDArray[np.int64]) -> bool:
