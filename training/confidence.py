@@ -99,7 +99,7 @@ def _of_landmarks(record: FrameRecord) -> dict[str, float]:
         int(record.diagnostics["landmark_matches"]),
         int(record.diagnostics["landmark_inliers"]),
     )
-    support = LandmarkSupport(followed, agreeing, bool(record.diagnostics.get("textured", 1.0)))
+    support = LandmarkSupport(followed, agreeing)
     return supported_by(record.diagnostics.get("confidence_before", record.confidence), support)
 
 

@@ -56,13 +56,6 @@ def test_doubt_says_why():
     assert judge_with_landmarks(DOUBTED, LandmarkSupport(40, 0)).reason == DOUBTED.reason
 
 
-def test_doubt_about_a_plain_object_says_that_it_is_plain():
-    hardly = Assessment(Status.TRACKED, "", 0.03)
-    assert (
-        "hardly any texture" in judge_with_landmarks(hardly, LandmarkSupport(300, 300, telling=False)).reason
-    )
-
-
 def test_what_is_lost_stays_lost():
     lost = Assessment(Status.LOST, "out of sight", 0.05)
     assert judge_with_landmarks(lost, LandmarkSupport(300, 300)) is lost

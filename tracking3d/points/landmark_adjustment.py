@@ -52,13 +52,10 @@ class LandmarkSupport:
     Attributes:
         followed: How many of them were found in the view.
         agreeing: How many of those where surface and pose put them; 0 if they were too few to be asked.
-        telling: Whether they are points of the object's texture; on a plain one they are shades and edges, which slide
-            over it as it turns, and agree with wrong poses.
     """
 
     followed: int
     agreeing: int
-    telling: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,6 @@ def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[As
         "confidence_before": estimate.confidence,
         "landmark_inliers": float(support.agreeing),
         "landmark_matches": float(support.followed),
-        "textured": float(support.telling),
     }
 
 
@@ -44,7 +43,7 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
     and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree adds
-    nothing to the share that does. On a plain object landmarks never raise a confidence.
+    nothing to the share that does. Plain objects have no landmarks: theirs is that of the rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -55,17 +54,11 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     evidence = refined_confidence_features(rendering.confidence, support)
     odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
     confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
-    if not support.telling:  # shades and edges slide over a plain surface, and agree with wrong poses, too
-        confidence = min(confidence, rendering.confidence)
     if confidence >= BELIEVED:
         return Assessment(Status.TRACKED, "", confidence)
     reason = rendering.reason
     if rendering.status is Status.TRACKED or not reason:
-        reason = (
-            f"too few landmark inliers ({support.agreeing} of {support.followed} matched landmarks)"
-            if support.telling
-            else "the object has hardly any texture: its rotation is poorly constrained"
-        )
+        reason = f"too few landmark inliers ({support.agreeing} of {support.followed} matched landmarks)"
     return Assessment(Status.UNCERTAIN, reason, confidence)
 
 

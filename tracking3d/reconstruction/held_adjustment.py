@@ -84,8 +84,13 @@ class HeldAdjustment:
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
     ) -> tuple[_Pose, LandmarkSupport | None]:
-        """The pose ``(4, 4)`` of a frame, and what landmarks say of it; a frame whose estimate stands keeps it."""
-        if record.index not in self._changed or record.status is Status.LOST or not self._views:
+        """The pose ``(4, 4)`` of a frame, and what landmarks say of it; a frame whose estimate stands keeps it.
+
+        So do all frames of a plain object, see `GlobalAdjustment.settle`.
+        """
+        if not self._views or float(np.median(self._strengths)) < PLAIN:
+            return record.T_cam_obj, None
+        if record.index not in self._changed or record.status is Status.LOST:
             return record.T_cam_obj, None
         view = self._view(record.T_cam_obj, image, mask)
         if view is None:
@@ -98,8 +103,7 @@ class HeldAdjustment:
         )
         resected, share = resect(scene, view, range(len(sources)))
         followed = max(self._shares[index].followed for index in sources)
-        telling = float(np.median(self._strengths)) >= PLAIN
-        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed), telling)
+        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model as it is: its surface was refined before."""

@@ -240,5 +240,7 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
     odds = _log_odds(fit, evidence)
     best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
     worst = max(odds, key=lambda name: best[name] - odds[name])
+    if worst == "inliers" and evidence.untextured:
+        return "the object has hardly any texture: its rotation is poorly constrained"
     axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)
