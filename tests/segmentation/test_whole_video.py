@@ -89,6 +89,13 @@ def test_frames_decided_side_by_side_are_the_same_to_the_last_digit(monkeypatch)
         np.testing.assert_array_equal(masks[0][index], masks[1][index])
 
 
+def test_a_doubted_pose_leaves_the_initial_mask_to_the_last_pixel():
+    frames = [answered(number, with_strip, confidence=0.15 if number == 6 else 0.9) for number in range(12)]
+    found = looked_at(frames)
+    np.testing.assert_array_equal(found[6], frames[6].initial)
+    assert (found[5] != frames[5].initial).any()
+
+
 def test_exact_masks_stay_what_they_are():
     found = looked_at([answered(number) for number in range(12)])
     assert min(overlap(mask, frame(number)[1]) for number, mask in found.items()) > 0.97

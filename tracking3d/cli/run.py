@@ -108,6 +108,7 @@ def _configure(
         object={
             "model": prompt.known,
             "flat": tracking.flat or None,
+            "trust_masks": tracking.trust_masks or None,
             "prototype": tracking.prototype,
             "size": output.object_size,
         },

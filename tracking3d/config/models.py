@@ -124,11 +124,18 @@ class ObjectConfig(Section):
             "frames follow the keyframes. 0 switches the adjustment off."
         ),
     )
+    trust_masks: bool = Field(
+        False,
+        description=(
+            "The initial masks are right: every frame that has one keeps it, and poses and surface are fitted to "
+            "it throughout."
+        ),
+    )
     refine_masks: bool = Field(
         True,
         description=(
             "Segment every frame again at the end of the final refinement, from shape, colour and motion in all frames "
-            "together."
+            "together. With trust_masks nothing is segmented again."
         ),
     )
     texture_views: int = Field(
@@ -163,6 +170,11 @@ class ObjectConfig(Section):
     flat: bool = Field(
         False, description="Planar object: project all vertices onto one plane after each iteration."
     )
+
+    @property
+    def segments_again(self) -> bool:
+        """Whether the final refinement segments every frame again."""
+        return self.refine_masks and not self.trust_masks
 
     @model_validator(mode="after")
     def _has_one_unit(self) -> ObjectConfig:

@@ -135,7 +135,7 @@ class FinalRefinement:
             with share_threads(cv2.getNumThreads()), measure("map") as watch:
                 self._last.adjust_all()
             self._estimates.together += watch.times
-            if self._session.config.object.refine_masks:
+            if self._session.config.object.segments_again:
                 self._last.begin_masks()
         self._writer.refine_camera(self._last.look.camera)
 

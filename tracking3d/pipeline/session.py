@@ -15,6 +15,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
 from tracking3d.estimation.solver import GuidedSolver, Solver
 from tracking3d.estimation.tracker_feedback import corrects
+from tracking3d.estimation.trusted_masks import with_initial_mask
 from tracking3d.estimation.undistortion import undistort_solver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
@@ -250,6 +251,8 @@ class Session(SessionRefinement):
                 self._state = solver.trust_mask(self._state, shown, mask.found)
             self._state, estimate = solver.step(self._state, shown, mask)
             estimate = self._presented.index(estimate)
+            if self.config.object.trust_masks:
+                estimate = with_initial_mask(estimate)
         except PluginFailure as error:
             failures.append(self._tolerate(error))
             estimate = lost_estimate(frame, mask, self._last_pose)

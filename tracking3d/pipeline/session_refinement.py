@@ -20,6 +20,7 @@ from tracking3d.estimation.solver import (
     RefiningSolver,
     Solver,
 )
+from tracking3d.estimation.trusted_masks import with_initial_mask
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.components import add_times
@@ -215,6 +216,8 @@ class SessionRefinement:
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         estimate = replace(estimate, refined=True)
+        if self.config.object.trust_masks:
+            estimate = with_initial_mask(estimate)
         if failure := self._failures.get(estimate.index):
             estimate = mark_failed(estimate, failure)
         return add_times(estimate, watch, frame)

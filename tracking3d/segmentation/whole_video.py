@@ -20,7 +20,13 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
-from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
+from tracking3d.segmentation.mask_extraction import (
+    clean_mask,
+    hold_to_initial,
+    paste_window,
+    pose_share,
+    snap_to_edges,
+)
 from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
@@ -156,8 +162,11 @@ class VideoSegmenter:
         asked = self.said(frame, order)
         if asked is None:
             return frame.index, None
+        if not pose_share(frame.confidence):
+            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
         scene, said = asked
         support = clean_mask(snap_to_edges(scene.image, said.log_odds(WEIGHTS), _ASKED))
+        support = hold_to_initial(support, scene.initial, frame.confidence)
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
         mask = full > 0

@@ -96,7 +96,7 @@ def _refine_in_parallel(
     ]
     estimates = {record.index: record for part in placed for record in part}
     seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
-    if not merged.begun.config.object.refine_masks:
+    if not merged.begun.config.object.segments_again:
         return PrecomputedRefinement(look, estimates, {}), seconds
     clock = time.monotonic()
     weighing = Weighing(looks[0], estimates, look)

@@ -107,3 +107,22 @@ def test_colours_of_a_frame_are_learnt():
 def test_the_answer_says_whether_it_is_more_than_the_input_handed_back():
     own = [source for source in MaskSource if source.is_own]
     assert own == [MaskSource.RENDERED, MaskSource.FUSED]
+
+
+@pytest.mark.parametrize("confidence", [0.0, 0.05, 0.2])
+def test_a_doubted_pose_redraws_nothing(confidence):
+    """Not even where its silhouette lies beyond the window."""
+    rendered, initial = disc(SIZE, (150, 80), 60), disc(SIZE, (104, 80), 47)
+    mask, source = answer(TRUTH, rendered, initial, confidence=confidence)
+    np.testing.assert_array_equal(mask, initial)
+    assert source is MaskSource.INITIAL
+
+
+def test_a_pose_redraws_the_more_the_more_it_is_believed():
+    initial = disc(SIZE, (113, 80), 50)
+    changed = [
+        int((answer(TRUTH, TRUTH, initial, confidence=confidence)[0] != initial).sum())
+        for confidence in (0.2, 0.25, 0.4, 0.9)
+    ]
+    assert changed[0] == 0 < changed[2]
+    assert changed == sorted(changed)

@@ -25,6 +25,14 @@ Features = Annotated[
 Flat = Annotated[
     bool, typer.Option("--flat", help="The object is planar, like a card.", rich_help_panel=TRACKING)
 ]
+TrustMasks = Annotated[
+    bool,
+    typer.Option(
+        "--trust-masks",
+        help="The initial masks are right, for example drawn by hand: keep them as they are.",
+        rich_help_panel=TRACKING,
+    ),
+]
 Prototype = Annotated[
     str | None,
     typer.Option(
@@ -62,6 +70,7 @@ class TrackingOptions:
     tracker: Tracker = None
     features: Features = None
     flat: Flat = False
+    trust_masks: TrustMasks = False
     prototype: Prototype = None
     final_refine: FinalRefine = None
     on_plugin_failure: OnPluginFailure = None

@@ -125,7 +125,8 @@ class FrameTracker(SolverBase):
         """A frame seen from a pose, with the mask weight that follows from the points."""
         on_object = followed.only(~state.object_map.candidate[followed.landmark])
         observation = self._observe(state, frame, mask, pose)
-        return Keyframe(observation, mask, pose, followed, mask_weight=mask_weight(mask, on_object))
+        weight = 1.0 if self.config.object.trust_masks else mask_weight(mask, on_object)
+        return Keyframe(observation, mask, pose, followed, mask_weight=weight)
 
     def _observe(
         self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose

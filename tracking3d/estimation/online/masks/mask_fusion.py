@@ -15,10 +15,12 @@ from tracking3d.segmentation import (
     ColourModels,
     as_lab,
     clean_mask,
+    hold_to_initial,
     in_question,
     log_odds,
     paste_window,
     pixel_features,
+    pose_share,
     snap_to_edges,
 )
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
@@ -69,6 +71,8 @@ def fuse_mask(
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
+    if not pose_share(confidence):
+        return FusedMask(initial, MaskSource.INITIAL)
     window, image = upsampled_window(observation)
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
@@ -77,10 +81,12 @@ def fuse_mask(
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     support = clean_mask(snap_to_edges(image, odds, asked))
+    support = hold_to_initial(support, own, confidence)
     support[~inside_frame(initial.shape, window)] = -1
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
-    # The window is the initial mask's: beyond it the silhouette alone defines the object.
-    full = paste_window(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
+    # The window is the initial mask's: beyond it the silhouette alone defines the object, if the pose is believed.
+    beyond = rendered if pose_share(confidence) == 1 else initial
+    full = paste_window(support, window, np.where(beyond, 1.0, -1.0).astype(np.float32))
     mask = full > 0
     if not mask.any():  # an empty mask means that the evidence supports neither
         return FusedMask(initial, MaskSource.INITIAL)
