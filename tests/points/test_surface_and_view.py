@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from twins import surface_under_pixels
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
@@ -82,3 +84,19 @@ def test_a_surface_moves_smoothly_under_its_landmarks():
     moved = move_surface(vertices, faces, face, weight, landmarks)
     assert np.abs(np.linalg.norm(moved, axis=1) - 1.1).max() < 0.03
     assert move_surface(vertices, faces, face[:0], weight[:0], landmarks[:0]) is vertices
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_surface_under_pixels_is_that_of_all_faces_to_the_last_digit(seed):
+    """Also on edges and corners, behind the camera, and where there is no pixel at all."""
+    random = np.random.default_rng(seed)
+    vertices = MESH.vertices * random.uniform(0.3, 1.5, 3) + [0, 0, random.uniform(0.5, 6)]
+    screen = vertices[:, :2] / vertices[:, 2:] * 300 + [160, 120]
+    corners = screen[random.integers(0, len(screen), 60)]
+    edges = (screen[MESH.faces[:40, 0]] + screen[MESH.faces[:40, 1]]) / 2
+    xy = np.vstack([random.uniform(-50, 370, (300, 2)), corners, corners.round(), edges])
+    for pixels in (xy, xy[:0]):
+        found = surface_under(screen, vertices[:, 2], MESH.faces, pixels)
+        expected = surface_under_pixels.surface_under(screen, vertices[:, 2], MESH.faces, pixels)
+        np.testing.assert_array_equal(found[0], expected[0])
+        np.testing.assert_array_equal(found[1], expected[1])

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from tracking3d.rendering.visibility import NEAR
 
 _EDGE = 1e-9  # barycentric slack, so that a ray through an edge does not slip between two faces
-_CHUNK = 256  # points met with all faces at once
+_SLACK = 1e-4  # pixels by which that reaches beyond a face's box
+_CHUNK = 256  # points compared with the boxes of all faces at once
 
 
 def surface_under(
@@ -34,21 +35,36 @@ def surface_under(
     corner, z = corner[front], z[front]
     face = np.full(len(xy), -1, dtype=np.int64)
     barycentric = np.full((len(xy), 3), np.nan)
-    for start in range(0, len(xy) if len(front) else 0, _CHUNK):
-        to_corner = corner - xy[start : start + _CHUNK, None, None]  # (n, F, 3, 2)
-        weight = _cross(np.roll(to_corner, -2, 2), np.roll(to_corner, -1, 2))
-        weight = weight / weight.sum(2, keepdims=True)
-        weight_by_depth = weight / z
-        inverse_depth = np.where((weight >= -_EDGE).all(2), weight_by_depth.sum(2), 0.0)
-        nearest = inverse_depth.argmax(1)
-        row = np.arange(len(nearest))
-        hit = inverse_depth[row, nearest] > 0
-        on_surface = (
-            weight_by_depth[row, nearest] / np.where(hit, inverse_depth[row, nearest], np.nan)[:, None]
-        )
-        face[start : start + _CHUNK] = np.where(hit, front[nearest], -1)
-        barycentric[start : start + _CHUNK] = on_surface
+    point, candidate = _faces_around(corner, xy)
+    to_corner = corner[candidate] - xy[point, None]  # (P, 3, 2)
+    weight = _cross(np.roll(to_corner, -2, 1), np.roll(to_corner, -1, 1))
+    weight = weight / weight.sum(1, keepdims=True)
+    weight_by_depth = weight / z[candidate]
+    inverse_depth = weight_by_depth.sum(1)
+    hit = (weight >= -_EDGE).all(1) & (inverse_depth > 0)
+    # The nearest of a point's faces comes first, and of those at one depth the first one.
+    order = np.lexsort((candidate, -inverse_depth, point))
+    order = order[hit[order]]
+    found, first = np.unique(point[order], return_index=True)
+    nearest = order[first]
+    face[found] = front[candidate[nearest]]
+    barycentric[found] = weight_by_depth[nearest] / inverse_depth[nearest, None]
     return face, barycentric
+
+
+def _faces_around(
+    corner: NDArray[np.float64], xy: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The pairs of a point ``(N, 2)`` and a face ``(F, 3, 2)`` whose box on the screen holds it."""
+    low, high = corner.min(1) - _SLACK, corner.max(1) + _SLACK
+    points, faces = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+    for start in range(0, len(xy), _CHUNK):
+        x, y = xy[start : start + _CHUNK].T[:, :, None]
+        inside = (x >= low[:, 0]) & (x <= high[:, 0]) & (y >= low[:, 1]) & (y <= high[:, 1])
+        point, face = np.nonzero(inside)
+        points.append(start + point)
+        faces.append(face)
+    return np.concatenate(points), np.concatenate(faces)
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
