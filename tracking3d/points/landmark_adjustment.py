@@ -40,6 +40,7 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
+_OUTLINES = 30  # views whose outlines the surface is fitted to
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 _Corners = tuple[NDArray[np.int64], Array, Array]
@@ -146,15 +147,23 @@ def fit_outlines(scene: LandmarkScene) -> LandmarkScene:
     Args:
         scene: As `refine_scene` left it; as it is where the images said little.
     """
-    if not any(support.agreeing for support in scene.support.values()):
+    if not is_supported(scene):
         return scene
     report_progress("fitting outlines")
     return _fit_surface(_refine_once(replace(_fit_surface(scene), may_reverse=False), free_focal=False))
 
 
+def is_supported(scene: LandmarkScene) -> bool:
+    """Whether the views of a scene shared enough landmarks in `refine_scene` for these to tell anything."""
+    return any(support.agreeing for support in scene.support.values())
+
+
 def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
-    vertices = fit_to_outlines(scene.vertices, scene.faces, [outline_of(view) for view in views.values()])
+    there = list(views.values())
+    places = np.unique(np.linspace(0, len(there) - 1, min(_OUTLINES, len(there))).round().astype(int))
+    outlines = [outline_of(there[place]) for place in places]
+    vertices = fit_to_outlines(scene.vertices, scene.faces, outlines)
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
     return replace(redrawn, support=scene.support)
 

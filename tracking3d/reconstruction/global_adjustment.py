@@ -20,7 +20,13 @@ from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmark_adjustment import LandmarkScene, LandmarkSupport, fit_outlines, refine_scene
+from tracking3d.points.landmark_adjustment import (
+    LandmarkScene,
+    LandmarkSupport,
+    fit_outlines,
+    is_supported,
+    refine_scene,
+)
 from tracking3d.points.resection import resect
 from tracking3d.points.view import SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
@@ -30,6 +36,9 @@ ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
 _DRAWN = 480
 """Views that all rounds draw together, if that allows for more than the least of them."""
+_BUNDLED = 48
+"""Views that are bundled; all that were kept, if these share too few landmarks. With more views the poses of
+box_in_hand and temple_ring were no better, and the time of a round grows with their square."""
 LONGEST_SIDE = 240
 """Pixels of the windows in which points are followed."""
 _LEAST_VIEWS = 4
@@ -85,15 +94,10 @@ class GlobalAdjustment:
         """
         if len(self._views) < _LEAST_VIEWS or not self._is_textured:
             return
-        self._bundled = sorted(self._views)
-        views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
-        self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
+        scene = self._refine(_BUNDLED)
+        if not is_supported(scene) and len(self._bundled) < len(self._views):
+            scene = self._refine(len(self._views))  # nearer to one another, views share more landmarks
         self._views = {}
-        scene = refine_scene(
-            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
-            int(np.clip(_DRAWN // len(views), *ROUNDS)),
-            free_focal=self.camera.assumed,
-        )
         self.vertices_of_landmarks = scene.vertices
         self._scene = fit_outlines(scene)
         self.vertices = self._scene.vertices
@@ -101,6 +105,19 @@ class GlobalAdjustment:
             self.camera = self.camera.with_solved_focal(scene.focal_factor)
         if scene.focal_deviation is not None:
             self.camera = replace(self.camera, focal_deviation=scene.focal_deviation)
+
+    def _refine(self, most: int) -> LandmarkScene:
+        """The scene of at most so many views, spread evenly, as their landmarks have it."""
+        there = sorted(self._views)
+        at = np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).round().astype(int))
+        self._bundled = [there[place] for place in at]
+        views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
+        self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
+        return refine_scene(
+            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
+            int(np.clip(_DRAWN // len(views), *ROUNDS)),
+            free_focal=self.camera.assumed,
+        )
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]

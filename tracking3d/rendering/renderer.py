@@ -6,7 +6,7 @@ of a `Rendering` is not computed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -37,29 +37,42 @@ class Rendering:
     Attributes:
         face_index: ``(B, H, W)`` int64, -1 where uncovered.
         depth: ``(B, H, W)`` z in camera coordinates, infinite where uncovered; no gradient, see `points`.
-        silhouette: ``(B, H, W)`` soft, in [0, 1].
         pixels: ``(P,)`` int64, flat indices of the covered pixels in ``(B, H, W)``.
-        uv: ``(P, 2)`` texture coordinates at the covered pixels.
         texture: ``(C, T, T)`` as given.
         x_cam: ``(B, V, 3)`` vertices in camera coordinates.
         screen: ``(B, V, 2)`` vertices in pixels.
         faces: ``(F, 3)``; face_uvs: ``(F, 3, 2)``; as given.
         K: ``(B, 3, 3)`` as given.
+        band: The kernel of the soft silhouette.
         backend: Which implementation was asked for.
     """
 
     face_index: Tensor
     depth: Tensor
-    silhouette: Tensor
     pixels: Tensor
-    uv: Tensor
     texture: Tensor
     x_cam: Tensor
     screen: Tensor
     faces: Tensor
     face_uvs: Tensor
     K: Tensor
+    band: SoftBand = SoftBand()
     backend: str = "auto"
+
+    @cached_property
+    def silhouette(self) -> Tensor:
+        """``(B, H, W)`` soft, in [0, 1]."""
+        return soft_silhouette(
+            self.screen, self.x_cam[..., 2], self.faces, self.face_index,
+            self.band.sigma, self.band.boxlen, self.band.knum, self.backend,
+        )  # fmt: skip
+
+    @cached_property
+    def uv(self) -> Tensor:
+        """``(P, 2)`` texture coordinates at the covered pixels."""
+        return interpolate(
+            self.screen, self.x_cam[..., 2], self.faces, self.face_uvs, self.face_index, self.backend
+        )
 
     @cached_property
     def features(self) -> Tensor:
@@ -90,6 +103,29 @@ class Rendering:
         return interpolate(
             self.screen, self.x_cam[..., 2], self.faces, corners, self.face_index, self.backend
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalRendering(Rendering):
+    """What another implementation has rendered.
+
+    Attributes:
+        soft_silhouette: `silhouette`.
+        texture_coordinates: `uv`.
+    """
+
+    soft_silhouette: Tensor = field(default_factory=Tensor)
+    texture_coordinates: Tensor = field(default_factory=Tensor)
+
+    @cached_property
+    def silhouette(self) -> Tensor:
+        """See `Rendering.silhouette`."""
+        return self.soft_silhouette
+
+    @cached_property
+    def uv(self) -> Tensor:
+        """See `Rendering.uv`."""
+        return self.texture_coordinates
 
 
 def to_camera(vertices: Tensor, R: Tensor, t: Tensor) -> Tensor:
@@ -159,14 +195,10 @@ def render(
         face_uvs=(face_uvs, "F 3 2"),
         texture=(texture, "C T T"),
     )
-    band = band or SoftBand()
     x_cam = to_camera(vertices, R, t)
-    screen, depth = to_screen(x_cam, K), x_cam[..., 2]
-    visibility = rasterize(screen, depth, faces, size, backend)
-    index = visibility.face_index
-    silhouette = soft_silhouette(screen, depth, faces, index, band.sigma, band.boxlen, band.knum, backend)
-    uv = interpolate(screen, depth, faces, face_uvs, index, backend)
+    screen = to_screen(x_cam, K)
+    visibility = rasterize(screen, x_cam[..., 2], faces, size, backend)
     return Rendering(
-        index, visibility.depth, silhouette, visibility.pixels, uv, texture, x_cam, screen, faces, face_uvs, K,
-        backend,
+        visibility.face_index, visibility.depth, visibility.pixels, texture, x_cam, screen, faces, face_uvs, K,
+        band or SoftBand(), backend,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from tracking3d.rendering import Rendering, SoftBand
-from tracking3d.rendering.renderer import to_camera, to_screen
+from tracking3d.rendering.renderer import ExternalRendering, to_camera, to_screen
 from tracking3d.rendering.visibility import NEAR
 
 CHUNK = 200_000
@@ -48,19 +48,20 @@ def render_dense(
     pixels = torch.nonzero(index >= 0)[:, 0]
     shape = (len(R), height, width)
     uv = uv[pixels]
-    return Rendering(
+    return ExternalRendering(
         index.reshape(shape),
         nearest.reshape(shape),
-        silhouette.reshape(shape),
         pixels,
-        uv,
         texture,
         x_cam,
         screen,
         faces,
         face_uvs,
         K,
+        band,
         "torch",
+        silhouette.reshape(shape),
+        uv,
     )
 
 
