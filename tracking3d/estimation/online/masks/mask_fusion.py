@@ -71,17 +71,18 @@ def fuse_mask(
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
-    if not pose_share(confidence):
-        return FusedMask(initial, MaskSource.INITIAL)
     window, image = upsampled_window(observation)
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
     told = moving() if moving is not None and asked >= _DISPUTED else None
+    if told is None and not pose_share(confidence):
+        return FusedMask(initial, MaskSource.INITIAL)
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     support = clean_mask(snap_to_edges(image, odds, asked))
-    support = hold_to_initial(support, own, confidence)
+    if told is None:
+        support = hold_to_initial(support, own, confidence)
     support[~inside_frame(initial.shape, window)] = -1
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
     # The window is the initial mask's: beyond it the silhouette alone defines the object, if the pose is believed.
