@@ -227,3 +227,23 @@ def test_what_corners_say_of_a_plain_object_changes_nothing(monkeypatch):
     given = disturbed()
     _, found = settled(given)
     np.testing.assert_allclose(found, given)
+
+
+@pytest.mark.parametrize("supported", [True, False])
+def test_few_views_are_bundled_and_all_of_them_only_where_those_share_too_few_landmarks(
+    monkeypatch, supported
+):
+    bundled = []
+    refine_scene = global_adjustment.refine_scene
+
+    def refine(scene, rounds, **given):
+        bundled.append(len(scene.views))
+        return refine_scene(scene, rounds, **given)
+
+    monkeypatch.setattr(global_adjustment, "_BUNDLED", 5)
+    monkeypatch.setattr(global_adjustment, "refine_scene", refine)
+    if not supported:
+        monkeypatch.setattr(global_adjustment, "is_supported", lambda scene: len(scene.views) > 5)
+    _, found = settled(disturbed())
+    assert bundled == ([5] if supported else [5, len(TRUE)])
+    assert rotation_errors(found).max() < 0.5 * rotation_errors(disturbed()).max()
