@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from tracking3d.rendering import Rendering, SoftBand
-from tracking3d.rendering.renderer import ExternalRendering, to_camera, to_screen
+from tracking3d.rendering.renderer import to_camera, to_screen
+from tracking3d.speed.dense import PrecomputedRendering
 
 FACES_PER_PIXEL = 30
 ABSENT = "it is not installed"
@@ -88,12 +89,12 @@ def render_pytorch3d(
 
     squared = torch.where((face >= 0) & ~covered[..., None], distance, torch.inf)
     rest = (1 - torch.exp(-band.sigma * squared)).prod(3)
-    return ExternalRendering(
+    return PrecomputedRendering(
         face_index=torch.where(covered, seen_face[..., 0] % len(faces), -1),
         depth=torch.where(covered, z.detach().gather(3, seen)[..., 0], torch.inf),
-        soft_silhouette=torch.where(covered, 1.0, 1 - rest),
+        given_silhouette=torch.where(covered, 1.0, 1 - rest),
         pixels=pixels,
-        texture_coordinates=uv.reshape(-1, 2).index_select(0, pixels),
+        given_uv=uv.reshape(-1, 2).index_select(0, pixels),
         texture=texture,
         x_cam=x_cam,
         screen=screen,

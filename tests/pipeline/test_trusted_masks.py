@@ -14,7 +14,6 @@ from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synt
 from tracking3d.video import open_source
 
 FRAMES = 14
-QUICK = "crop.size=64", "object.frequency=5", "object.texture_views=0"
 
 
 @pytest.fixture(scope="module")

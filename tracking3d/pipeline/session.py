@@ -139,6 +139,8 @@ class Session(SessionRefinement):
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
         self._state, estimate = solver.init(frame, mask)
+        if self.config.object.trust_masks:
+            estimate = with_initial_mask(estimate)
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
         if self._tracker.waits:

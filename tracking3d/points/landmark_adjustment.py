@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -40,10 +40,11 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
-_OUTLINES = 30  # views whose outlines the surface is fitted to
+_MOST_OUTLINES = 30  # most views whose outlines the surface is fitted to
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
-_Corners = tuple[NDArray[np.int64], Array, Array]
+Corners = tuple[NDArray[np.int64], Array, Array]
+"""What `seeds` finds."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,18 @@ class LandmarkScene:
     def radius(self) -> float:
         """Half the diagonal of the object's box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0))) / 2
+
+    def seeds_of(self, index: int) -> Corners:
+        """Where landmarks begin in a view, see `seeds`; searched for once."""
+        if index not in self._seeds:
+            view = self.views[index]
+            assert view is not None
+            self._seeds[index] = seeds(view, self.vertices, self.faces)
+        return self._seeds[index]
+
+    @cached_property
+    def _seeds(self) -> dict[int, Corners]:
+        return {}
 
     def warps(self) -> Warps:
         """The views for carrying points between them."""
@@ -161,7 +174,7 @@ def is_supported(scene: LandmarkScene) -> bool:
 def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
     there = list(views.values())
-    places = np.unique(np.linspace(0, len(there) - 1, min(_OUTLINES, len(there))).round().astype(int))
+    places = np.unique(np.linspace(0, len(there) - 1, min(_MOST_OUTLINES, len(there))).round().astype(int))
     outlines = [outline_of(there[place]) for place in places]
     vertices = fit_to_outlines(scene.vertices, scene.faces, outlines)
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
@@ -188,7 +201,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
         return scene
     views = [view for view in scene.views if view is not None]
     T = np.stack([view.T_cam_obj for view in views])
-    corners = [seeds(view, scene.vertices, scene.faces) for view in views]
+    corners = [scene.seeds_of(index) for index in there]
     spread = np.unique(np.linspace(0, len(there) - 1, START_VIEWS).round().astype(int))
     begun = _begin(scene, there, corners, spread)
     # Spread evenly, the views may all show one side of an object that goes to and fro or round.
@@ -262,7 +275,7 @@ class _Begun:
 
 
 def _begin(
-    scene: LandmarkScene, there: Sequence[int], corners: Sequence[_Corners], starts: NDArray[np.integer]
+    scene: LandmarkScene, there: Sequence[int], corners: Sequence[Corners], starts: NDArray[np.integer]
 ) -> _Begun:
     """Landmarks that begin in some views, followed through all.
 
@@ -321,7 +334,7 @@ def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
     return np.sort(np.array(chosen))
 
 
-def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> _Corners:
+def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> Corners:
     """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
     ``(N, 2)`` of each.
     """

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tracking3d.rendering.visibility import NEAR
 
 _EDGE = 1e-9  # barycentric slack, so that a ray through an edge does not slip between two faces
-_SLACK = 1e-4  # pixels by which that reaches beyond a face's box
+_SLACK = 1e-4  # pixels; more than the barycentric slack is on the screen, on faces up to 100,000 pixels long
 _CHUNK = 256  # points compared with the boxes of all faces at once
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tracking3d.points.landmark_adjustment import DEVIATION, TOLERANCE, LandmarkScene, seeds
+from tracking3d.points.landmark_adjustment import DEVIATION, TOLERANCE, LandmarkScene
 from tracking3d.points.robust_bundle import bundle
 from tracking3d.points.view import Array, SurfaceView, redraw_surface
 from tracking3d.points.warping import Warps
@@ -30,7 +30,9 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
         others = [scene.views[index] for index in known]
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
-            _carry_tracks(scene, warps, source) for source in range(len(others)) if others[source] is not None
+            _carry_tracks(scene, warps, source, index)
+            for source, index in enumerate(known)
+            if others[source] is not None
         ]
         if not found:
             return view, share
@@ -48,11 +50,9 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
     return view, share
 
 
-def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int) -> tuple[Array, Array, Array]:
-    """Points in space under corners of a view, their pixels in the last view, and deviations of these."""
-    view = warps.views[source]
-    assert view is not None
-    face, barycentric, xy = seeds(view, scene.vertices, scene.faces)
+def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int, index: int) -> tuple[Array, Array, Array]:
+    """Points in space under corners of a view, their pixels in the last warped view, and deviations of these."""
+    face, barycentric, xy = scene.seeds_of(index)
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     carried = warps.carry(source, len(warps.views) - 1, xy)
     return points, carried.measured, np.sqrt(carried.variance + DEVIATION**2)

@@ -43,7 +43,7 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
     and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree adds
-    nothing to the share that does. Plain objects have no landmarks: theirs is that of the rendering.
+    nothing to the share that does. A plain object has no landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.estimation.online.features.klt import grey
-from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
+from tracking3d.estimation.online.features.texture_strength import has_texture, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.landmark_adjustment import (
@@ -36,9 +36,10 @@ ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
 _DRAWN = 480
 """Views that all rounds draw together, if that allows for more than the least of them."""
-_BUNDLED = 48
+_USUAL_VIEWS = 48
 """Views that are bundled; all that were kept, if these share too few landmarks. With more views the poses of
-box_in_hand and temple_ring were no better, and the time of a round grows with their square."""
+box_in_hand were no better, and the time of a round grows with their square."""
+_FRAMES_A_VIEW = 5  # frames of a long video for each view that is bundled
 LONGEST_SIDE = 240
 """Pixels of the windows in which points are followed."""
 _LEAST_VIEWS = 4
@@ -64,6 +65,7 @@ class GlobalAdjustment:
     def __init__(self, model: ObjectModel, camera: Camera, answered: Sequence[int], most: int) -> None:
         self.camera, self.vertices = camera, np.asarray(model.vertices, np.float64)
         self.vertices_of_landmarks = self.vertices
+        self._frames = len(answered)
         self._lens, self.faces = camera.fx, np.asarray(model.faces, np.int64)
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
@@ -79,7 +81,7 @@ class GlobalAdjustment:
         return index in self._wanted
 
     def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
-        """Keep a frame, if it is one of those to be bundled and its object was found."""
+        """Keep a frame, if it is one of those that may be bundled and its object was found."""
         if self.wants(record.index) and record.status is not Status.LOST:
             view = self._view(record.T_cam_obj, image, mask)
             if view is not None:
@@ -92,9 +94,10 @@ class GlobalAdjustment:
         Corners that are found on a plain surface are shades and edges, which slide over it: what they say of its poses
         is worse than what pixels and outlines said before.
         """
-        if len(self._views) < _LEAST_VIEWS or not self._is_textured:
+        if len(self._views) < _LEAST_VIEWS or not has_texture(self._strengths):
+            self._views = {}
             return
-        scene = self._refine(_BUNDLED)
+        scene = self._refine(max(_USUAL_VIEWS, self._frames // _FRAMES_A_VIEW))
         if not is_supported(scene) and len(self._bundled) < len(self._views):
             scene = self._refine(len(self._views))  # nearer to one another, views share more landmarks
         self._views = {}
@@ -161,11 +164,6 @@ class GlobalAdjustment:
         """What the texture is taken from, with the pose that its frame has in the end."""
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
-
-    @property
-    def _is_textured(self) -> bool:
-        """Whether landmarks can tell anything on this object."""
-        return float(np.median(self._strengths)) >= PLAIN
 
     def _between(self, index: int, before: int, after: int) -> _Pose:
         """The pose of a frame in which the object was not found: it goes on steadily from one view to the next."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.estimation.online.features.klt import grey
-from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
+from tracking3d.estimation.online.features.texture_strength import has_texture, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.landmark_adjustment import LandmarkScene, LandmarkSupport
@@ -88,7 +88,7 @@ class HeldAdjustment:
 
         So do all frames of a plain object, see `GlobalAdjustment.settle`.
         """
-        if not self._views or float(np.median(self._strengths)) < PLAIN:
+        if not self._views or not has_texture(self._strengths):
             return record.T_cam_obj, None
         if record.index not in self._changed or record.status is Status.LOST:
             return record.T_cam_obj, None

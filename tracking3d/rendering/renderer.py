@@ -6,7 +6,7 @@ of a `Rendering` is not computed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -103,29 +103,6 @@ class Rendering:
         return interpolate(
             self.screen, self.x_cam[..., 2], self.faces, corners, self.face_index, self.backend
         )
-
-
-@dataclass(frozen=True, eq=False)
-class ExternalRendering(Rendering):
-    """What another implementation has rendered.
-
-    Attributes:
-        soft_silhouette: `silhouette`.
-        texture_coordinates: `uv`.
-    """
-
-    soft_silhouette: Tensor = field(default_factory=Tensor)
-    texture_coordinates: Tensor = field(default_factory=Tensor)
-
-    @cached_property
-    def silhouette(self) -> Tensor:
-        """See `Rendering.silhouette`."""
-        return self.soft_silhouette
-
-    @cached_property
-    def uv(self) -> Tensor:
-        """See `Rendering.uv`."""
-        return self.texture_coordinates
 
 
 def to_camera(vertices: Tensor, R: Tensor, t: Tensor) -> Tensor:

@@ -5,25 +5,20 @@ When all frames are known, `tracking3d.segmentation.whole_video` does the same w
 """
 
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
-from tracking3d.segmentation.mask_extraction import (
-    clean_mask,
-    hold_to_initial,
-    paste_window,
-    pose_share,
-    snap_to_edges,
-)
+from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.online_features import SOURCES, in_question, log_odds, pixel_features
+from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
 
 __all__ = [
     "SOURCES",
     "ColourModels",
     "as_lab",
+    "blend_with_initial",
     "clean_mask",
-    "hold_to_initial",
     "in_question",
     "log_odds",
     "paste_window",
     "pixel_features",
-    "pose_share",
+    "pose_weight",
     "snap_to_edges",
 ]

@@ -14,8 +14,6 @@ from tracking3d.trackers.segmentation import SMOOTHER
 
 _SMOOTHNESS, _EDGES = 100.0, 12.0
 _THIN = 0.03  # of the root of the area: what is thinner is no part of the object
-_DOUBTED, _BELIEVED = 0.2, 0.4
-"""Confidence of a pose up to which it redraws nothing, and from which it has its say in full."""
 _LEAST_PART = 0.1  # of the largest part's area
 
 
@@ -50,26 +48,6 @@ def clean_mask(support: NDArray[np.float32]) -> NDArray[np.float32]:
     area = statistics[1:, cv2.CC_STAT_AREA]
     large = 1 + np.flatnonzero(area >= _LEAST_PART * area.max(initial=0))
     return np.where(np.isin(part, large), support, -np.abs(support)).astype(np.float32)
-
-
-def pose_share(confidence: float) -> float:
-    """How far a pose of some confidence may redraw the initial mask, in [0, 1]."""
-    return min(max((confidence - _DOUBTED) / (_BELIEVED - _DOUBTED), 0.0), 1.0)
-
-
-def hold_to_initial(
-    support: NDArray[np.float32], initial: NDArray[np.bool_], confidence: float
-) -> NDArray[np.float32]:
-    """``(S, S)`` support that is the initial mask's as far as the pose is doubted.
-
-    Args:
-        support: ``(S, S)`` in [-1, 1], from silhouette, initial mask and image.
-        initial: ``(S, S)`` the mask tracker's mask.
-        confidence: The confidence of the pose.
-    """
-    share = np.float32(pose_share(confidence))
-    held = share * support + (1 - share) * np.where(initial, 1, -1)
-    return np.asarray(held, np.float32)
 
 
 def paste_window(

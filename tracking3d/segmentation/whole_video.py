@@ -20,14 +20,9 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
-from tracking3d.segmentation.mask_extraction import (
-    clean_mask,
-    hold_to_initial,
-    paste_window,
-    pose_share,
-    snap_to_edges,
-)
+from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
+from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
 from tracking3d.segmentation.whole_video_features import PixelEvidence
@@ -159,14 +154,14 @@ class VideoSegmenter:
     def _decided(self, frame: Answered, order: TemporalNeighbours) -> tuple[int, SegmentedMask | None]:
         if self._due is not None and frame.index not in self._due:
             return frame.index, None
+        if not pose_weight(frame.confidence):
+            return frame.index, None
         asked = self.said(frame, order)
         if asked is None:
             return frame.index, None
-        if not pose_share(frame.confidence):
-            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
         scene, said = asked
-        support = clean_mask(snap_to_edges(scene.image, said.log_odds(WEIGHTS), _ASKED))
-        support = hold_to_initial(support, scene.initial, frame.confidence)
+        odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, frame.confidence)
+        support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
         mask = full > 0

@@ -7,16 +7,42 @@ pairs of 7 frames would not fit into memory.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from tracking3d.rendering import Rendering, SoftBand
-from tracking3d.rendering.renderer import ExternalRendering, to_camera, to_screen
+from tracking3d.rendering.renderer import to_camera, to_screen
 from tracking3d.rendering.visibility import NEAR
 
 CHUNK = 200_000
 """Pairs that are computed at once; larger chunks are slower, they leave the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PrecomputedRendering(Rendering):
+    """A rendering of another implementation, which gives everything at once.
+
+    Attributes:
+        given_silhouette: The `silhouette`.
+        given_uv: The `uv`.
+    """
+
+    given_silhouette: Tensor
+    given_uv: Tensor
+
+    @cached_property
+    def silhouette(self) -> Tensor:
+        """See `Rendering.silhouette`."""
+        return self.given_silhouette
+
+    @cached_property
+    def uv(self) -> Tensor:
+        """See `Rendering.uv`."""
+        return self.given_uv
 
 
 def render_dense(
@@ -48,20 +74,20 @@ def render_dense(
     pixels = torch.nonzero(index >= 0)[:, 0]
     shape = (len(R), height, width)
     uv = uv[pixels]
-    return ExternalRendering(
-        index.reshape(shape),
-        nearest.reshape(shape),
-        pixels,
-        texture,
-        x_cam,
-        screen,
-        faces,
-        face_uvs,
-        K,
-        band,
-        "torch",
-        silhouette.reshape(shape),
-        uv,
+    return PrecomputedRendering(
+        face_index=index.reshape(shape),
+        depth=nearest.reshape(shape),
+        pixels=pixels,
+        texture=texture,
+        x_cam=x_cam,
+        screen=screen,
+        faces=faces,
+        face_uvs=face_uvs,
+        K=K,
+        band=band,
+        backend="torch",
+        given_silhouette=silhouette.reshape(shape),
+        given_uv=uv,
     )
 
 

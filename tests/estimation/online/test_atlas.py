@@ -260,17 +260,15 @@ PLAIN_IMAGE = np.full((180, 240), 120, np.uint8)
 @pytest.mark.parametrize(
     ("change", "lost", "doubtful", "needed"),
     [
-        ({}, 0, 24, False),
-        ({}, 0, 25, True),
+        ({}, 0, 50, False),
         ({}, 1, 1, True),
         ({"fixed_keyframes": 3}, 1, 1, False),
-        ({"fixed_keyframes": 3}, 0, 50, False),
-        ({"pointless": True}, 0, 24, False),
-        ({"pointless": True}, 0, 25, True),
+        ({"pointless": True}, 0, 19, False),
+        ({"pointless": True}, 0, 20, True),
         ({"pointless": True}, 1, 1, True),
     ],
 )
-def test_a_second_map_is_begun_if_the_object_is_lost_or_has_been_doubted_for_long(
+def test_a_second_map_is_begun_if_the_object_is_lost_or_a_map_without_points_is_doubted_for_long(
     change, lost, doubtful, needed
 ):
     state, _ = run(FIRST)

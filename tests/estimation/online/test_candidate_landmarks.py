@@ -156,9 +156,9 @@ def test_next_to_an_object_that_rested_a_point_is_promoted_only_after_it_has_tur
     """On a table everything moves in the image as the object does, while a hand holds the camera."""
     monkeypatch.setattr(candidate_landmarks, "_MIN_MOTION", 2.0)  # pixels
     little, much = (
-        replace(with_tracks(rigid(angles), angles=angles), resting=True) for angles in (SMALL, ANGLES)
+        replace(with_tracks(rigid(angles), angles=angles), started_at_rest=True) for angles in (SMALL, ANGLES)
     )
-    assert not recruited(replace(little, resting=False)).candidate.any()
+    assert not recruited(replace(little, started_at_rest=False)).candidate.any()
     undecided = recruited(little)
     assert undecided.candidate.all()
     assert shown(undecided) == {0}  # it is not dropped: later frames decide

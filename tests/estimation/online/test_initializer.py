@@ -132,7 +132,7 @@ NUDGE = [0.0] * 6 + [11.0, 15.0]  # degrees
 
 
 @pytest.mark.parametrize(
-    ("angles", "resting", "ended", "started"),
+    ("angles", "started_at_rest", "ended", "started"),
     [
         (NUDGE, False, False, True),
         (NUDGE, True, False, False),
@@ -140,18 +140,18 @@ NUDGE = [0.0] * 6 + [11.0, 15.0]  # degrees
         ([*NUDGE, 24.0], True, False, True),
     ],
 )
-def test_a_nudge_starts_no_object_that_rested_until_then(asked, angles, resting, ended, started):
+def test_a_nudge_starts_no_object_that_rested_until_then(asked, angles, started_at_rest, ended, started):
     given = belief_of(angles)
-    given = replace(given, object_map=replace(given.object_map, resting=resting))
+    given = replace(given, object_map=replace(given.object_map, started_at_rest=started_at_rest))
     assert (try_initialize(given, CONFIG, ended=ended)[1] is not None) is started
     assert bool(asked["points"]) is started
 
 
 def test_an_object_that_was_still_for_long_rests_and_one_that_has_gone_does_not(asked):
     state, _ = try_initialize(belief_of([0.0] * 41), CONFIG)
-    assert state.object_map.resting
+    assert state.object_map.started_at_rest
     state, _ = try_initialize(belief_of(STILL), CONFIG)
-    assert not state.object_map.resting
+    assert not state.object_map.started_at_rest
 
 
 def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):

@@ -29,7 +29,7 @@ TrustMasks = Annotated[
     bool,
     typer.Option(
         "--trust-masks",
-        help="The initial masks are right, for example drawn by hand: keep them as they are.",
+        help="The masks of all frames (--masks) are right, for example drawn by hand: keep them.",
         rich_help_panel=TRACKING,
     ),
 ]

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.atlas.map_alignment import merge_maps
-from tracking3d.estimation.online.atlas.reinitialization import is_doubted
 from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
@@ -72,6 +71,6 @@ class FrameMapping(ContinuedRefinement):
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated
         estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
-        if not (found.lost or is_doubted(updated) or (state.object_map.pointless and found.doubtful)):
+        if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         return updated, replace(estimate, keyframe=is_keyframe)

@@ -261,7 +261,7 @@ class OnlineSolver(MapExtension):
         """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
 
         Args:
-            state: After the frame, in which the object is lost or has been doubted for long.
+            state: After the frame, in which the object is lost.
             estimate: Of the frame.
             frame: The frame.
             mask: ``(H, W)`` its initial mask.
@@ -291,6 +291,4 @@ class OnlineSolver(MapExtension):
         again = transform_estimates(again, similarity, state.camera)
         if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
             return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
-        if state.phase is not SolverPhase.LOST:  # the last frame has a pose with both maps
-            return replace(switched, unaligned=state.unaligned), again
         return switched, mark_unaligned(again)

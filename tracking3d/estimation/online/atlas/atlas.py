@@ -20,7 +20,7 @@ from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens, pose_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
 from tracking3d.estimation.online.tracking.motion_model import extrapolate_motion
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
@@ -52,19 +52,14 @@ def with_lens_of(state: SolverState, begun: SolverState) -> SolverState:
 
 
 def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
-    """The guessed similarity from a new map to the one before: equal size, and the rotation extrapolated over the gap.
-
-    If there is no gap, the rotation is that of the last frame, which both maps have.
+    """The guessed similarity from a new map to a lost one: equal size, and the rotation extrapolated over the gap.
 
     Args:
-        state: The state with the map before.
+        state: The state with the lost map.
         begun: The state after the second initialization.
     """
-    if state.phase is not SolverPhase.LOST:
-        state = replace(state, trajectory=(state.last_pose,))
-    shared = [view for view in begun.object_map.keyframes if view.index == state.trajectory[-1][1]]
     turns = []
-    for view in shared or begun.object_map.keyframes:
+    for view in begun.object_map.keyframes:
         R_before, _ = pose_arrays(extrapolate_motion(state.trajectory, view.index))
         turns.append(R_before.T @ pose_arrays(view.pose)[0])
     # The rotation nearest to all of the candidates.

@@ -101,6 +101,7 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
         candidate=np.concatenate([first.candidate, second.candidate]),
         keyframes=cull_keyframes(tuple(keyframes), most),
         pointless=first.pointless and second.pointless,
+        started_at_rest=first.started_at_rest or second.started_at_rest,
     )
     return prune_landmarks(object_map, FollowedPoints.none())[0]
 

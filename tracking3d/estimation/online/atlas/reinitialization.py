@@ -1,4 +1,4 @@
-"""Whether an object that is lost, or doubted for long, can be initialized a second time, with a map of its own."""
+"""Whether a lost object can be initialized a second time, with a map of its own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverS
 from tracking3d.frames import Frame
 from tracking3d.segmentation import as_lab
 
-_LASTING_DOUBT = 25  # doubtful frames in a row, about a second, from which a map is doubted itself
+_LASTING_DOUBT = 20  # doubtful frames in a row from which a map without points is doubted itself
 _MIN_MASK_IOU = 0.3  # IoU of two frames' masks, below which they show different objects
 _MIN_COLOUR_RATIO = -0.5  # mean log ratio of the colours, below which a mask shows another object
 
@@ -21,8 +21,8 @@ _MIN_COLOUR_RATIO = -0.5  # mean log ratio of the colours, below which a mask sh
 def needs_second_map(state: SolverState, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> bool:
     """Whether a second map is begun, or continued, after a frame.
 
-    It is if the object is lost, or if its poses have been doubtful for long. A map without points is given up only if
-    there is texture now: another map without points would be no better.
+    It is if the object is lost. A map without points is given up if its poses have been doubtful for long, too, but
+    only if there is texture now: another map without points would be no better.
 
     Args:
         state: After the frame.
@@ -31,14 +31,10 @@ def needs_second_map(state: SolverState, image: NDArray[np.uint8], mask: NDArray
     """
     if state.object_map.fixed_keyframes:
         return False
-    if state.phase is not SolverPhase.LOST and not is_doubted(state):
-        return False
-    return not state.object_map.pointless or texture_strength(image, mask) >= PLAIN
-
-
-def is_doubted(state: SolverState) -> bool:
-    """Whether the poses have been doubtful for so long that the map may be the reason."""
-    return state.doubtful_frames >= _LASTING_DOUBT
+    if not state.object_map.pointless:
+        return state.phase is SolverPhase.LOST
+    doubted = state.phase is SolverPhase.LOST or state.doubtful_frames >= _LASTING_DOUBT
+    return doubted and texture_strength(image, mask) >= PLAIN
 
 
 def masks_overlap(before: NDArray[np.bool_] | None, mask: NDArray[np.bool_]) -> bool:

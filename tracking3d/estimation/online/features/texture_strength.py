@@ -7,6 +7,7 @@ poses that explain them are wrong, however well they fit.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -49,3 +50,8 @@ def texture_strength(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float
     if not inside.any():
         return 0.0
     return float(np.median(cv2.cornerMinEigenVal(smooth, _BLOCK, ksize=3)[inside > 0]))
+
+
+def has_texture(strengths: Sequence[float]) -> bool:
+    """Whether an object with these strengths in some frames has enough texture for its points to be reliable."""
+    return bool(strengths) and float(np.median(strengths)) >= PLAIN

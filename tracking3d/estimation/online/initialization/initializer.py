@@ -32,8 +32,8 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 MOTION = 0.03
 """Image deformation at which an initialization is first tried, see `image_deformation`."""
 _MOTION_AFTER_REST = 0.06
-"""The same for an object that rested until then: a hand that takes hold of a thing nudges it, and what it shows by that
-is little, while the hand covers some of it."""
+"""The same for an object that rested until then: a hand that takes hold of a thing nudges it by a few degrees, which tell
+little of its shape, and the hand covers some of it."""
 _RETRY_FACTOR = 1.3  # factor by which the deformation must grow before the next attempt
 _MAX_BUNDLE_COST = 0.5  # bundle cost above which the points are not reliable: residuals of 0.8 pixels
 _MAX_PENDING = 40  # most pending frames
@@ -137,14 +137,14 @@ def try_initialize(
     motion = image_deformation(tracks_of(views, names[~state.object_map.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
-    least = _MOTION_AFTER_REST if state.object_map.resting else MOTION
+    least = _MOTION_AFTER_REST if state.object_map.started_at_rest else MOTION
     # A textured object whose points keep their arrangement has not turned, however much covers it or moves with it.
     if motion < least and not ended and (shared <= _MIN_SHARED or len(views) >= _MAX_PENDING):
         state = replace(state, waiting_reason=_NOT_MOVED, ambiguous_frames=0)
         if shared <= _MIN_SHARED:
             return replace(state, pending=_recent_frames(waiting)), None
-        resting = replace(state.object_map, resting=True)
-        return replace(state, object_map=resting, pending=_subsample(waiting)), None
+        at_rest = replace(state.object_map, started_at_rest=True)
+        return replace(state, object_map=at_rest, pending=_subsample(waiting)), None
     waited = ended or len(views) >= _MAX_PENDING
     # Points that fail do not gain from more motion: pixels and outlines are used instead.
     wild = motion > _MAX_DEFORMATION and len(views) >= _MIN_FRAMES_WITHOUT_POINTS
@@ -159,7 +159,7 @@ def try_initialize(
     state = replace(state, next_attempt=motion * _RETRY_FACTOR)
     may_wait = not waited and shared > _MIN_SHARED and motion < _DECISIVE_MOTION
     # Without motion any shape explains the points.
-    starts = _starts_from_points(state, views, config) if motion >= (MOTION if ended else least) else []
+    starts = _starts_from_points(state, views, config) if motion >= MOTION else []
     if may_wait and _is_undecided(starts, motion, state.ambiguous_rotation):
         return replace(
             state, waiting_reason=_TWO_WAYS, ambiguous_frames=len(views), ambiguous_rotation=_turn(starts[0])

@@ -106,7 +106,7 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
     enough = tracks.visible.sum(0) >= _VIEWS
     fits = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
     accepted = fits
-    if object_map.resting:
+    if object_map.started_at_rest:
         accepted = fits & (_rotation_seen(views, tracks.visible, first) > _MIN_ROTATION)
     rejected = stays | (enough & ((residual > _MIN_OUTLIER_RESIDUAL) | ~near) & (motion > _MIN_MOTION))
     rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~fits

@@ -14,13 +14,13 @@ from tracking3d.geometry.camera import Window
 from tracking3d.segmentation import (
     ColourModels,
     as_lab,
+    blend_with_initial,
     clean_mask,
-    hold_to_initial,
     in_question,
     log_odds,
     paste_window,
     pixel_features,
-    pose_share,
+    pose_weight,
     snap_to_edges,
 )
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
@@ -76,22 +76,34 @@ def fuse_mask(
     sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
     told = moving() if moving is not None and asked >= _DISPUTED else None
-    if told is None and not pose_share(confidence):
-        return FusedMask(initial, MaskSource.INITIAL)
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
-    support = clean_mask(snap_to_edges(image, odds, asked))
-    if told is None:
-        support = hold_to_initial(support, own, confidence)
-    support[~inside_frame(initial.shape, window)] = -1
+    support = _extract(image, odds, asked, initial, window)
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
-    # The window is the initial mask's: beyond it the silhouette alone defines the object, if the pose is believed.
-    beyond = rendered if pose_share(confidence) == 1 else initial
+    if not share:  # nothing but the silhouette speaks against the initial mask
+        if not pose_weight(confidence):
+            return FusedMask(initial, MaskSource.INITIAL)
+        support = _extract(image, blend_with_initial(odds, own, confidence), asked, initial, window)
+    # The window is the initial mask's: beyond it the silhouette of a pose that is believed defines the object alone.
+    beyond = rendered if share or pose_weight(confidence) == 1 else initial
     full = paste_window(support, window, np.where(beyond, 1.0, -1.0).astype(np.float32))
     mask = full > 0
     if not mask.any():  # an empty mask means that the evidence supports neither
         return FusedMask(initial, MaskSource.INITIAL)
     return FusedMask(mask, MaskSource.FUSED, 0.5 + 0.5 * full, share)
+
+
+def _extract(
+    image: NDArray[np.uint8],
+    odds: NDArray[np.float32],
+    asked: float,
+    initial: NDArray[np.bool_],
+    window: Window,
+) -> NDArray[np.float32]:
+    """``(S, S)`` support in the window, negative beyond the frame."""
+    support = clean_mask(snap_to_edges(image, odds, asked))
+    support[~inside_frame(initial.shape, window)] = -1
+    return support
 
 
 def update_colours(

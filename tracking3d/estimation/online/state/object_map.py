@@ -68,8 +68,8 @@ class ObjectMap:
             and those that move with it.
         fixed_keyframes: How many of the first keyframes are rendered from an object that was known before. Its shape is
             fixed, and its surface points count as seen often. 0 if the map is built from the video.
-        resting: Whether the object was still when tracking began: until it has turned, the things next to it move in
-            the image as it does.
+        started_at_rest: Whether the object was still when tracking began: until it has turned, the things next to it
+            move in the image as it does.
     """
 
     shape: Shape
@@ -82,7 +82,7 @@ class ObjectMap:
     renderer: str = "auto"
     candidates_around: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
     fixed_keyframes: int = 0
-    resting: bool = False
+    started_at_rest: bool = False
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:

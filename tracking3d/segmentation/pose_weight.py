@@ -1,0 +1,37 @@
+"""How far a pose may redraw an initial mask: a doubted one not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_NO_WEIGHT, _FULL_WEIGHT = 0.2, 0.4
+"""Confidence of a pose up to which it redraws nothing, and from which it has its say in full."""
+_INITIAL_LOG_ODDS = 2.0
+"""Log-odds of the pixels of an initial mask, and less those beside it, where it is weighed against a doubted pose."""
+
+
+def pose_weight(confidence: float) -> float:
+    """The weight of a pose's silhouette beside the initial mask, in [0, 1].
+
+    Args:
+        confidence: The confidence of the pose, in [0, 1].
+    """
+    return min(max((confidence - _NO_WEIGHT) / (_FULL_WEIGHT - _NO_WEIGHT), 0.0), 1.0)
+
+
+def blend_with_initial(
+    log_odds: NDArray[np.float32], initial: NDArray[np.bool_], confidence: float
+) -> NDArray[np.float32]:
+    """``(S, S)`` log-odds in which the initial mask counts as far as the pose is doubted.
+
+    Args:
+        log_odds: ``(S, S)`` from silhouette, initial mask and image together.
+        initial: ``(S, S)`` the mask tracker's mask.
+        confidence: The confidence of the pose, in [0, 1].
+    """
+    weight = pose_weight(confidence)
+    if weight == 1:
+        return log_odds
+    alone = np.where(initial, _INITIAL_LOG_ODDS, -_INITIAL_LOG_ODDS)
+    return np.asarray(weight * log_odds + (1 - weight) * alone, np.float32)
