@@ -39,7 +39,8 @@ def test_run_writes_the_folder_and_prints_the_closing_table(call, clip, script):
 def test_options_reach_the_configuration(call, clip, script, tmp_path):
     (tmp_path / "mine.yaml").write_text("preset: paper\nsolver: {knum: 7, iterations: 9}")
     options = (
-        "--flat --prototype ellipsoid --size 64 --device cpu --seed 5 --set solver.iterations=3 --fov 30"
+        "--flat --trust-masks --prototype ellipsoid --size 64 --device cpu --seed 5 --fov 30 "
+        "--set solver.iterations=3"
     )
     result = call(
         "run", clip, *BOX, *options.split(), "--config", "mine.yaml", "--intrinsics", "70,70,32,24", "--quiet"
@@ -48,6 +49,7 @@ def test_options_reach_the_configuration(call, clip, script, tmp_path):
     [(config, prompt)] = script.built
     assert (config.solver.knum, config.solver.iterations) == (7, 3)
     assert (config.object.flat, config.object.prototype) == (True, "ellipsoid")
+    assert config.object.trust_masks
     assert (config.crop.size, config.runtime.device, config.runtime.seed) == (64, "cpu", 5)
     assert (config.camera.fov, config.camera.intrinsics) == (30, (70, 70, 32, 24))
     assert prompt.box == (20, 10, 20, 20)

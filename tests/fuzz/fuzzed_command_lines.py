@@ -12,6 +12,7 @@ RUN_OPTIONS = (
 )  # fmt: skip
 RUN_FLAGS = (
     "--flat",
+    "--trust-masks",
     "--overwrite",
     "--quiet",
     "--final-refine",

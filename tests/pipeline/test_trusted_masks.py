@@ -49,4 +49,6 @@ def test_trusted_masks_come_back_in_causal_and_refined_estimates(images, rough, 
     for reader in (found, RunReader(tmp_path / "trusted", refined=False)):
         for frame in reader.frames:
             np.testing.assert_array_equal(reader.mask(frame.index), reader.initial_mask(frame.index))
+    weights = [frame.diagnostics.get("mask_confidence", 1.0) for frame in found.frames]
+    assert weights == [1.0] * FRAMES
     assert any((usual.mask(index) != usual.initial_mask(index)).any() for index in range(FRAMES))
