@@ -32,8 +32,8 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 MOTION = 0.03
 """Image deformation at which an initialization is first tried, see `image_deformation`."""
 _MOTION_AFTER_REST = 0.06
-"""The same for an object that rested until then: a hand that takes hold of a thing nudges it by a few degrees. They tell
-little of its shape, and the hand covers some of it."""
+"""The same for an object that rested until then. A hand that takes hold of a thing nudges it by a few degrees, which
+tell little of its shape, and covers some of it."""
 _RETRY_FACTOR = 1.3  # factor by which the deformation must grow before the next attempt
 _MAX_BUNDLE_COST = 0.5  # bundle cost above which the points are not reliable: residuals of 0.8 pixels
 _MAX_PENDING = 40  # most pending frames
