@@ -191,13 +191,20 @@ def test_a_run_without_fault_has_few_doubts(make_turning_run):
     assert doubts_of(RunReader(folder)) == []
 
 
-def test_a_run_that_added_nothing_to_its_masks_says_so(run_folder):
+@pytest.mark.parametrize("trusted", [False, True])
+def test_a_run_that_added_nothing_to_its_masks_says_so_unless_it_was_to_keep_them(
+    run_folder, described, trusted
+):
+    described(run_folder, config={"object": {"trust_masks": trusted}})
     lines = [json.loads(line) for line in (run_folder / "frames.jsonl").read_text().splitlines()]
     changed = [json.dumps(line | {"mask_source": "initial"}) for line in lines]
     (run_folder / "frames.jsonl").write_text("\n".join(changed) + "\n")
-    assert any(
-        doubt.startswith("All masks are the mask tracker's") for doubt in doubts_of(RunReader(run_folder))
-    )
+    said = [
+        doubt
+        for doubt in doubts_of(RunReader(run_folder))
+        if doubt.startswith("All masks are the mask tracker's")
+    ]
+    assert len(said) == (not trusted)
 
 
 def test_the_notes_of_a_run_are_doubts(run_folder, described):

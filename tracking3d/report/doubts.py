@@ -74,7 +74,7 @@ def _about_frames(run: RunReader) -> list[str]:
 
 def _about_masks(run: RunReader) -> list[str]:
     sources = [record.mask_source for record in run.frames]
-    if not run.frames or None in sources or run.config["object"].get("trust_masks"):
+    if not run.frames or None in sources or (run.config.get("object") or {}).get("trust_masks"):
         return []
     if not any(source is not None and source.is_own for source in sources):
         return ["All masks are the mask tracker's, unchanged."]
