@@ -40,7 +40,10 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
-_MOST_OUTLINES = 30  # most views whose outlines the surface is fitted to
+_FEW_OUTLINES, _OUTLINE_SHARE = (
+    30,
+    0.6,
+)  # the surface is fitted to those of so many views, or of that share of more
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 Corners = tuple[NDArray[np.int64], Array, Array]
@@ -174,7 +177,8 @@ def is_supported(scene: LandmarkScene) -> bool:
 def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
     there = list(views.values())
-    places = np.unique(np.linspace(0, len(there) - 1, min(_MOST_OUTLINES, len(there))).round().astype(int))
+    count = min(max(_FEW_OUTLINES, round(_OUTLINE_SHARE * len(there))), len(there))
+    places = np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))
     outlines = [outline_of(there[place]) for place in places]
     vertices = fit_to_outlines(scene.vertices, scene.faces, outlines)
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
