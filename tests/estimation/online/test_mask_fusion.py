@@ -144,7 +144,7 @@ def test_what_moves_with_the_object_is_added_however_much_the_pose_is_doubted():
     assert iou(found.mask, TRUTH) > iou(initial, TRUTH) + 0.05
 
 
-def test_a_pose_redraws_the_more_the_more_it_is_believed():
+def test_a_pose_redraws_the_more_the_higher_its_confidence_is():
     initial = disc(SIZE, (113, 80), 50)
     changed = [
         int((answer(TRUTH, TRUTH, initial, confidence=confidence)[0] != initial).sum())
