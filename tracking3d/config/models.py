@@ -121,8 +121,8 @@ class ObjectConfig(Section):
         le=2000,
         description=(
             "Most keyframes in the final bundle adjustment of poses, surface and, if not given, focal length. 48 or a "
-            "fifth of the frames are taken unless they share too few landmarks. The other frames follow them. 0 switches "
-            "the adjustment off."
+            "fifth of the frames are taken unless they share too few landmarks. The other frames follow them. 0 "
+            "switches the adjustment off."
         ),
     )
     trust_masks: bool = Field(
