@@ -16,7 +16,6 @@ from large_arrays import memory_stays_below, write_zeros
 from tracking3d import Frame, Session, load_config
 from tracking3d.checkpoint import serialization
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.milestones import _compress
 from tracking3d.checkpoint.progress import JournalEntry, RunProgress, checksum
 from tracking3d.checkpoint.serialization import INLINE, NotSerializableError, TreeFolder
 from tracking3d.errors import InputError
@@ -226,9 +225,11 @@ def test_many_small_files_of_large_arrays_are_counted_together(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("value", [LARGE, np.zeros((64, 80)), np.zeros((300, 400), bool)])
-def test_the_compressed_arrays_of_a_rollback_point_come_back(tmp_path, value):
+def test_compressed_arrays_as_earlier_versions_wrote_them_come_back(tmp_path, value):
     text = TreeFolder(tmp_path, CLASSES).text(value)
-    _compress(tmp_path / "00000000.npz")
+    path = tmp_path / "00000000.npz"
+    with np.load(path) as arrays:
+        np.savez_compressed(path, **dict(arrays))
     assert_same(TreeFolder(tmp_path, CLASSES).read(json.loads(text)), value)
 
 
@@ -267,7 +268,8 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
     for index, image in enumerate(clip.images):
         session.step(Frame(index, image))
         taken = JournalEntry(index, checksum(image), 0.5, "so", True, "")
-        checkpoint.save(RunProgress(last=index, lines=10 * index), session.state_dict(), taken)
+        checkpoint.note(taken)
+        checkpoint.save(RunProgress(last=index, lines=10 * index), session.state_dict())
         kept = Checkpoint(tmp_path, session.state_classes).read()
         assert_same(kept.session, session.state_dict())
         assert (kept.progress.last, kept.progress.lines, kept.taken[index]) == (index, 10 * index, taken)
@@ -279,14 +281,16 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
 def test_the_journal_ends_where_the_state_says(tmp_path):
     checkpoint = Checkpoint(tmp_path, ())
     checkpoint.note(SkippedFrame(0, "torn"))
-    checkpoint.save(RunProgress(last=1), {}, JournalEntry(1, 5))
+    checkpoint.note(JournalEntry(1, 5))
+    checkpoint.save(RunProgress(last=1), {})
     journal = tmp_path / layout.STATE / layout.JOURNAL
     with journal.open("ab") as file:
         file.write(b'{"index": 2, "pict')
     again = Checkpoint(tmp_path, ())
     kept = again.read()
     assert (list(kept.taken), kept.skipped) == ([1], (SkippedFrame(0, "torn"),))
-    again.save(RunProgress(last=2), {}, JournalEntry(2, 6))
+    again.note(JournalEntry(2, 6))
+    again.save(RunProgress(last=2), {})
     assert list(Checkpoint(tmp_path, ()).read().taken) == [1, 2]
     journal.write_bytes(journal.read_bytes()[:20])
     with pytest.raises(InputError, match="too short"):

@@ -16,11 +16,13 @@ from resumable_runs import Stopped, assert_alike, files_of, settings, stop_at
 
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.open_tracking import request_tracking
 from tracking3d.pipeline.record import RecordOptions, record, record_objects, record_tracking
+from tracking3d.pipeline.recorder import ObjectRecorder
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout, run_writer
@@ -70,11 +72,11 @@ def let_go(writer: run_writer.RunWriter, *_) -> None:
 MOMENTS = {
     "in the first frame": (Session, "step", 0),
     "in a later frame": (Session, "step", 3),
-    "before its state is kept": (Checkpoint, "save", 3),
+    "before its state is noted": (RunState, "advance", 3),
     "before the first state": (Checkpoint, "save", 0),
     "while all is solved once more": (Session, "refine", 0),
     "in a second answer": (Session, "refine_frame", 2),
-    "before the second state is kept": (Checkpoint, "save", FRAMES + 3),
+    "before its second state is noted": (RunState, "advance", FRAMES + 3),
     "while masks are taken over": (FrameLines, "append", FRAMES),
     "while the mesh is written": (run_writer.RunWriter, "_finish", 0),
 }
@@ -89,6 +91,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
     with monkeypatch.context() as patch:
         if killed:  # nothing is written at the end, as little as after SIGKILL
             patch.setattr(run_writer.RunWriter, "finish", let_go)
+            patch.setattr(ObjectRecorder, "give_up", lambda self, error: let_go(self._writer))
             if moment == "while the mesh is written":
                 pytest.skip("there is no such moment: the end is not written")
         stopped(patch, clip, images, folder, *MOMENTS[moment])
@@ -106,13 +109,16 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
     expected = [("step", n) for n in range(FRAMES)] + [("refine_frame", n) for n in range(FRAMES)]
     begun = {
         "in a later frame": 3,
-        "before its state is kept": 3,
+        "before its state is noted": 3,
         "while all is solved once more": FRAMES,
         "in a second answer": FRAMES + 2,
-        "before the second state is kept": FRAMES + 2,
+        "before its second state is noted": FRAMES + 3,
         "while masks are taken over": 2 * FRAMES,
         "while the mesh is written": 2 * FRAMES,
     }
+    if killed:  # the state is that of the first frame, or of the start of the refinement
+        begun |= {"in a later frame": 1, "before its state is noted": 1}
+        begun |= {"in a second answer": FRAMES, "before its second state is noted": FRAMES}
     assert answered == expected[begun.get(moment, 0) :]
     with av.open(str(folder / layout.OVERLAY)) as video:
         assert sum(1 for _ in video.decode(video=0)) == FRAMES

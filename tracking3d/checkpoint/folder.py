@@ -1,7 +1,7 @@
 """The checkpoint of a run on disk: one JSON file that is replaced whole, and the files that it names.
 
-After a kill at any moment it is the state of one finished frame: arrays and the journal are written first, and a file
-that the state names is removed only once another state has taken its place.
+After a kill at any moment it is the state of a finished frame, not necessarily the last one: arrays and the journal are
+written first, and a file that the state names is removed only once another state has taken its place.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tracking3d.results.files import read_mask, write_atomic, write_mask, writin
 from tracking3d.results.run_reader import FormatError
 
 VERSION = 2
-MOST_KEPT = 200 * 10**6
+MOST_KEPT = 100 * 10**6
 """Bytes that rollback points may take in the folder of a run that is finished."""
 
 
@@ -54,31 +54,39 @@ class Checkpoint:
         self._taken: dict[int, int] = {}  # number of frames taken up to each of them
         self._journal = 0
         self._waiting = b""
+        self._is_new = False
 
     def note(self, frame: SkippedFrame | JournalEntry) -> None:
-        """Note a frame that was skipped, or whose state is not saved; it is written with the next state."""
+        """Note a frame that was taken for the first time, or skipped; it is written with the next state."""
         self._waiting += journal_line(frame)
+        if isinstance(frame, JournalEntry):
+            self._taken[frame.index] = len(self._taken) + 1
+            self._is_new = True
+
+    @property
+    def rollback_point_due(self) -> bool:
+        """Whether the state after the frame that was noted last is to be a rollback point."""
+        return self._is_new and self._milestones.due(len(self._taken))
 
     def save(
         self,
         progress: RunProgress,
         session: dict[str, Any],
-        taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
     ) -> None:
-        """Save the state after a frame.
+        """Save the state after the frames that were noted.
 
         Args:
             progress: Progress of the run.
             session: The session's state.
-            taken: The frame, if it was taken for the first time.
-            revised: Earlier frames whose estimates it changed: no correction can continue from between.
+            revised: Earlier frames whose estimates have changed since the state before: no correction can continue
+                from between.
 
         Raises:
             OutputError: If it cannot be written; the state before is then still there.
             NotSerializableError: If the session holds an object that cannot be saved.
         """
-        lines = self._waiting + (journal_line(taken) if taken else b"")
+        lines = self._waiting
         with writing(self._folder):
             tree = self._trees.text(session)
             if lines:
@@ -93,10 +101,9 @@ class Checkpoint:
             self._milestones.forget_after(
                 min((self._taken.get(one, 0) - 1 for one in revised), default=len(self._taken))
             )
-            if taken:
-                self._taken[taken.index] = len(self._taken) + 1
-                if self._milestones.due(count := len(self._taken)):
-                    self._milestones.keep(self._folder / layout.STATE_FILE, count, self._trees.arrays)
+            if self.rollback_point_due:
+                self._milestones.keep(self._folder / layout.STATE_FILE, len(self._taken), self._trees.arrays)
+            self._is_new = False
             if progress.refining and progress.last_refined < 0:
                 state = self._folder / layout.STATE_FILE
                 self._milestones.keep_refinement_start(state, len(self._taken), self._trees.arrays)

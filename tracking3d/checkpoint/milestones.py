@@ -6,15 +6,13 @@ of the states around it, so that few of them, spread evenly over the run, cost l
 
 from __future__ import annotations
 
-import io
 import math
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.results import layout
-from tracking3d.results.files import link_or_copy, write_atomic
+from tracking3d.results.files import link_or_copy
 
 _FIRST_GAP = 4
 """Frames from one to the next in a short run; it is doubled whenever there are too many."""
@@ -131,8 +129,8 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
 
     Args:
         folder: The run folder.
-        most_bytes: Their largest size, before compression. Every second rollback point goes until the rest is no
-            larger; the last one stays longest.
+        most_bytes: Their largest size. Every second rollback point goes until the rest is no larger; the last one
+            stays longest.
 
     Raises:
         OSError: If a file cannot be removed.
@@ -153,21 +151,6 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
     for path in layout.state_files(folder):
         if not kept or (path.parent == inner and path.name not in needed):
             path.unlink(missing_ok=True)
-        elif path.suffix == ".npz":
-            _compress(path)
-
-
-def _compress(path: Path) -> None:
-    """Write an array file again, compressed to a third; during the run there is no time for that."""
-    with zipfile.ZipFile(path) as file:
-        if all(one.compress_type == zipfile.ZIP_DEFLATED for one in file.infolist()):
-            return
-        parts = {name: file.read(name) for name in file.namelist()}
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
-        for name, part in parts.items():
-            file.writestr(name, part)
-    write_atomic(path, data.getvalue())
 
 
 def _bytes(inner: Path, kept: list[Milestone]) -> int:

@@ -1,4 +1,4 @@
-"""Progress of a run: saved on disk after each step, as long as the session's state can be saved."""
+"""Progress of a run: saved on disk every few steps, as long as the session's state can be saved."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from tracking3d.checkpoint.progress import JournalEntry, RunProgress, SavedState
 from tracking3d.checkpoint.serialization import NotSerializableError
 
 _log = logging.getLogger(__name__)
+
+SAVED_EVERY = 10
+"""Steps from one saved state to the next; at most so many frames are computed again after a kill."""
 
 
 class RunState:
@@ -32,19 +35,22 @@ class RunState:
         self.checkpoint, self.kept = checkpoint, kept
         self.progress = self.before = kept.progress if kept else RunProgress()
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
+        self._steps = 0
+        self._unsaved: dict[str, Any] | None = None
+        self._revised: set[int] = set()
 
     def has(self, index: int) -> bool:
         """Whether the stopped run has had frame ``index``."""
         return index in self._past
 
-    def save(
+    def advance(
         self,
         session: dict[str, Any],
         taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
         **changes: Any,
     ) -> None:
-        """Keep the state after a step.
+        """Take one step; the state is saved after the first one, then after every `SAVED_EVERY`-th.
 
         Args:
             session: The session's state.
@@ -58,9 +64,33 @@ class RunState:
         self.progress = replace(self.progress, **changes)
         if self.checkpoint is None:
             return
+        if taken is not None:
+            self.checkpoint.note(taken)
+        self._unsaved = session
+        self._revised.update(revised)
+        if self._steps % SAVED_EVERY == 0 or self.checkpoint.rollback_point_due:
+            self.save()
+        self._steps += 1
+
+    def save(self, session: dict[str, Any] | None = None, **changes: Any) -> None:
+        """Save the state now.
+
+        Args:
+            session: The session's state; that of the last step if None.
+            changes: What is new in `progress`.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        self.progress = replace(self.progress, **changes)
+        session = self._unsaved if session is None else session
+        if self.checkpoint is None or session is None:
+            return
+        self._unsaved = None
         try:
-            self.checkpoint.save(self.progress, session, taken, revised)
+            self.checkpoint.save(self.progress, session, self._revised)
         except NotSerializableError as error:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self.checkpoint.remove()
             self.checkpoint = None
+        self._revised.clear()

@@ -102,7 +102,7 @@ class FinalRefinement:
         estimates = self._estimates
         record = estimates.write(estimate, frame, initial)
         if session:
-            self._state.save(
+            self._state.advance(
                 session,
                 last_refined=frame.index,
                 refined_lines=estimates.lines,
@@ -129,6 +129,7 @@ class FinalRefinement:
 
     def adjust_all(self) -> None:
         """All frames were taken again: adjust poses, surface and lens together."""
+        self._state.save()
         if self._precomputed is not None:
             self._write_precomputed(self._precomputed)
         else:

@@ -152,7 +152,7 @@ class ObjectRecorder:
                 checkpoint.keep_correction(frame.index, estimate.mask)
             revised = [one.index for one in estimate.revised]
             so_far = {"lines": self._writer.lines, "seconds": self._writer.seconds}
-            self._state.save(session, taken, revised, last=frame.index, **so_far)
+            self._state.advance(session, taken, revised, last=frame.index, **so_far)
         return record
 
     def _replay_saved(
@@ -199,6 +199,7 @@ class ObjectRecorder:
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: refine everything, or record why not though it was asked for."""
         self._unmet.warn()
+        self._state.save()
         estimates = self._open_refinement(source)
         if estimates is not None:
             estimates.together = self._session.refining
@@ -294,11 +295,14 @@ class ObjectRecorder:
 
     def pause(self) -> None:
         """Stop here; the folder is that of a stopped run, which can be resumed."""
+        self._state.save()
         self._writer.finish(_model_so_far(self._session), "interrupted")
 
     def give_up(self, error: BaseException) -> None:
         """Save the finished frames when ``error`` ends the run, and add this to ``error``."""
         self._work.end()
+        with suppress(OutputError):  # the first error is reported
+            self._state.save()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
         if self._causal_model is not None and not self._temporary:
