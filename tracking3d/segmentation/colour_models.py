@@ -14,6 +14,8 @@ from tracking3d.trackers.colour_models import Palette, histograms, log_ratio
 from tracking3d.trackers.outline import inside_distance
 
 _RATE = 0.1
+_BAND = 0.04
+"""Of the root of the area: outlines are compared as near to either of them."""
 _INSIDE, _BESIDE = 0.03, (0.06, 0.4)
 """Distances from an outline, relative to the root of the area, from and within which a pixel surely is on its side."""
 _NEIGHBOURHOOD = 0.4
@@ -107,6 +109,17 @@ def relative_distance(
     if area in (0, mask.size):  # without an outline everything is far on one side of it
         return np.full(mask.shape, 1.0 if area else -1.0, np.float32)
     return (inside_distance(mask) if distance is None else distance) / math.sqrt(area)
+
+
+def outline_difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> float | None:
+    """How far two outlines are apart in the mean; None if they are nowhere near anything.
+
+    Args:
+        first: ``(S, S)`` relative distance to the one, see `relative_distance`.
+        second: ``(S, S)`` to the other.
+    """
+    band = np.minimum(np.abs(first), np.abs(second)) < _BAND
+    return float(np.abs(first - second)[band].mean()) if band.any() else None
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

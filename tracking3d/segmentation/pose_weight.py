@@ -21,16 +21,15 @@ def pose_weight(confidence: float) -> float:
 
 
 def blend_with_initial(
-    log_odds: NDArray[np.float32], initial: NDArray[np.bool_], confidence: float
+    log_odds: NDArray[np.float32], initial: NDArray[np.bool_], weight: float
 ) -> NDArray[np.float32]:
-    """``(S, S)`` log-odds in which the initial mask counts as far as the pose is doubted.
+    """``(S, S)`` log-odds in which the initial mask alone has the rest of the weight.
 
     Args:
         log_odds: ``(S, S)`` from silhouette, initial mask and image together.
         initial: ``(S, S)`` the mask tracker's mask.
-        confidence: The confidence of the pose, in [0, 1].
+        weight: Of ``log_odds``, in [0, 1]; see `pose_weight`.
     """
-    weight = pose_weight(confidence)
     if weight == 1:
         return log_odds
     alone = np.where(initial, _INITIAL_LOG_ODDS, -_INITIAL_LOG_ODDS)

@@ -20,6 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
+from tracking3d.segmentation.initial_mask_agreement import STANDS, InitialMaskAgreement
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
@@ -82,6 +83,7 @@ class VideoSegmenter:
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}
         self._consensus = SoftVisualHull(vertices)
+        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices))
         self._colours: ColourModels | None = None
         self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
         self._jobs: OrderedExecutor | None = None
@@ -97,11 +99,13 @@ class VideoSegmenter:
         scene = self._scene(frame)
         if scene is not None and scene.answer.any():
             self._consensus.see(scene)
+            self._agreement.see(scene)
             self._colours = ColourModels.of(as_lab(scene.image), scene.answer, self._colours)
 
     def settle(self) -> None:
         """All frames were seen a first time."""
         self._consensus.settle()
+        self._agreement.settle()
 
     def decide(self, frame: Answered) -> Iterator[tuple[int, SegmentedMask | None]]:
         """A frame for the second time.
@@ -160,7 +164,11 @@ class VideoSegmenter:
         if asked is None:
             return frame.index, None
         scene, said = asked
-        odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, frame.confidence)
+        stands = self._agreement.of_frame(scene)
+        if stands >= STANDS:
+            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
+        weight = (1 - stands) * pose_weight(frame.confidence)
+        odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, weight)
         support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))

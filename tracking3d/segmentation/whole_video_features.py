@@ -13,7 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.segmentation.colour_models import ColourModels, as_lab, beside_outline, relative_distance
+from tracking3d.segmentation.colour_models import (
+    ColourModels,
+    as_lab,
+    beside_outline,
+    outline_difference,
+    relative_distance,
+)
 from tracking3d.segmentation.edge_alignment import alignment, edge_strength
 from tracking3d.segmentation.frame_window import FrameWindow
 from tracking3d.trackers.outline import inside_distance
@@ -23,7 +29,7 @@ Plane = NDArray[np.float32]
 _DEEP, _NEAR, _AT_OUTLINE, _MOST = 0.25, 0.08, 0.02, 1.5
 _BESIDE = 0.15
 """Nothing further outside all masks, relative to the root of the area, is the object's."""
-_BAND, _APART = 0.04, 0.03
+_APART = 0.03
 _SCALE_OF_LOGS, _SCALE_OF_MOTION = 3.0, 2.0
 
 
@@ -122,6 +128,5 @@ class PixelEvidence:
         drawn = self.distances.get("drawn")
         if drawn is None:
             return 2.0
-        initial = self.distances["initial"]
-        band = np.minimum(np.abs(initial), np.abs(drawn)) < _BAND
-        return float(np.clip(np.abs(initial - drawn)[band].mean() / _APART, 0, 2)) if band.any() else 2.0
+        difference = outline_difference(self.distances["initial"], drawn)
+        return 2.0 if difference is None else min(difference / _APART, 2.0)

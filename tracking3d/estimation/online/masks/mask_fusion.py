@@ -83,7 +83,9 @@ def fuse_mask(
     if not share:  # nothing but the silhouette speaks against the initial mask
         if not pose_weight(confidence):
             return FusedMask(initial, MaskSource.INITIAL)
-        support = _extract(image, blend_with_initial(odds, own, confidence), asked, initial, window)
+        support = _extract(
+            image, blend_with_initial(odds, own, pose_weight(confidence)), asked, initial, window
+        )
     # The window is the initial mask's: beyond it the silhouette of a reliable pose defines the object alone.
     beyond = rendered if share or pose_weight(confidence) == 1 else initial
     full = paste_window(support, window, np.where(beyond, 1.0, -1.0).astype(np.float32))

@@ -1,0 +1,113 @@
+"""Masks of a turning block: exact ones agree with each other, whatever the surface can follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from tracking3d.geometry.camera import Camera
+from tracking3d.segmentation.frame_window import Answered, FrameWindow, surface_in
+from tracking3d.segmentation.initial_mask_agreement import STANDS, InitialMaskAgreement
+from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
+from tracking3d.segmentation.whole_video import VideoSegmenter, segment_all
+
+CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
+BLOCK = trimesh.creation.box((2.4, 0.8, 1.2))
+BALL = trimesh.creation.icosphere(3)
+FRAMES = 16
+Spoil = Callable[[int, np.ndarray], np.ndarray]
+
+
+def pose(number: int, step: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("yx", [step * number, 20], degrees=True).as_matrix()
+    T[:3, 3] = 0, 0, 7
+    return T
+
+
+def exact(number: int, mask: np.ndarray) -> np.ndarray:
+    return mask
+
+
+def with_a_strip(number: int, mask: np.ndarray) -> np.ndarray:
+    """Background on another side in each frame."""
+    return mask | np.roll(mask, (-1) ** number * (4 + number % 3), number % 2)
+
+
+def frames(spoil: Spoil = exact, step: float = 12) -> list[Answered]:
+    found = []
+    for number in range(FRAMES):
+        T = pose(number, step)
+        mask, _ = surface_in(CAMERA.K, T, np.asarray(BLOCK.vertices), np.asarray(BLOCK.faces), 160)
+        initial = spoil(number, mask[:120])
+        image = np.random.default_rng(number).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+        found.append(Answered(number, image, initial, initial, T, 0.9))
+    return found
+
+
+def agreement(given: list[Answered], mesh: trimesh.Trimesh = BALL) -> InitialMaskAgreement:
+    vertices = np.asarray(mesh.vertices, np.float64)
+    found = InitialMaskAgreement(SoftVisualHull(vertices))
+    for one in given:
+        scene = scene_of(one, mesh)
+        found.see(scene)
+    found.settle()
+    return found
+
+
+def scene_of(one: Answered, mesh: trimesh.Trimesh = BALL) -> FrameWindow:
+    scene = FrameWindow.of(
+        one, CAMERA, np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    )
+    assert scene is not None
+    return scene
+
+
+def test_exact_masks_stand_though_the_surface_is_a_ball():
+    assert agreement(frames()).weight >= STANDS
+
+
+def test_masks_that_differ_from_frame_to_frame_do_not():
+    assert agreement(frames(with_a_strip)).weight < 0.1
+
+
+def test_a_surface_that_fits_as_well_is_not_overruled():
+    assert agreement(frames(), BLOCK).weight == 0
+
+
+def test_without_turning_agreement_says_nothing():
+    assert agreement(frames(step=0.5)).weight == 0
+
+
+def test_too_few_frames_say_nothing():
+    assert agreement(frames()[:3]).weight == 0
+    assert agreement([]).weight == 0
+
+
+def test_a_single_mask_unlike_the_others_does_not_stand():
+    given = frames()
+    found = agreement(given)
+    other = replace(given[5], initial=np.roll(given[5].initial, 9, 0))
+    assert found.of_frame(scene_of(given[4])) >= STANDS
+    assert found.of_frame(scene_of(other)) < 0.5
+
+
+def test_exact_masks_come_back_from_the_whole_video():
+    given = frames()
+    known = VideoSegmenter(
+        CAMERA,
+        np.asarray(BALL.vertices, np.float64),
+        np.asarray(BALL.faces, np.int64),
+        {one.index: one.confidence for one in given},
+    )
+    for one in given:
+        known.see(one)
+    known.settle()
+    spoiled = [replace(one, answer=with_a_strip(one.index, one.initial)) for one in given]
+    for (index, decided), one in zip(segment_all(known, spoiled), given, strict=True):
+        assert index == one.index and decided is not None
+        assert np.count_nonzero(decided.mask ^ one.initial) < 0.005 * np.count_nonzero(one.initial)
