@@ -253,3 +253,8 @@ class PipelineConfig(Section):
     crop: CropConfig = CropConfig()
     solver: SolverConfig = OnlineConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+
+    @property
+    def masks_given(self) -> bool:
+        """Whether the user gives the initial masks of all frames."""
+        return self.tracker.name == "precomputed"

@@ -63,6 +63,7 @@ class VideoSegmenter:
         faces: ``(F, 3)``.
         confidences: Of the frames that have a pose, by index.
         due: Indices of the frames that are decided; all if None.
+        given: Whether the user gives the initial masks: they stand if they agree with each other.
 
     Attributes:
         order: The latest frames of the second time.
@@ -75,6 +76,7 @@ class VideoSegmenter:
         faces: NDArray[np.int64],
         confidences: dict[int, float],
         due: Collection[int] | None = None,
+        given: bool = False,
     ) -> None:
         self._camera, self._vertices, self._faces = camera, vertices, faces
         self._due = due
@@ -83,7 +85,7 @@ class VideoSegmenter:
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}
         self._consensus = SoftVisualHull(vertices)
-        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices))
+        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices)) if given else None
         self._colours: ColourModels | None = None
         self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
         self._jobs: OrderedExecutor | None = None
@@ -99,13 +101,15 @@ class VideoSegmenter:
         scene = self._scene(frame)
         if scene is not None and scene.answer.any():
             self._consensus.see(scene)
-            self._agreement.see(scene)
+            if self._agreement is not None:
+                self._agreement.see(scene)
             self._colours = ColourModels.of(as_lab(scene.image), scene.answer, self._colours)
 
     def settle(self) -> None:
         """All frames were seen a first time."""
         self._consensus.settle()
-        self._agreement.settle()
+        if self._agreement is not None:
+            self._agreement.settle()
 
     def decide(self, frame: Answered) -> Iterator[tuple[int, SegmentedMask | None]]:
         """A frame for the second time.
@@ -164,7 +168,7 @@ class VideoSegmenter:
         if asked is None:
             return frame.index, None
         scene, said = asked
-        stands = self._agreement.of_frame(scene)
+        stands = 0.0 if self._agreement is None else self._agreement.of_frame(scene)
         if stands >= STANDS:
             return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
         weight = (1 - stands) * pose_weight(frame.confidence)
