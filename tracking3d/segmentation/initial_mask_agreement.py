@@ -51,7 +51,9 @@ class InitialMaskAgreement:
     def settle(self) -> None:
         """All frames are there: compute the weight."""
         self.hull.settle()
-        places = np.linspace(0, len(self._scenes) - 1, min(_MOST_FRAMES, len(self._scenes))).round().astype(int)
+        places = (
+            np.linspace(0, len(self._scenes) - 1, min(_MOST_FRAMES, len(self._scenes))).round().astype(int)
+        )
         differences = [self._difference(self._scenes[place]) for place in places]
         self._scenes = []
         known = [one for one in differences if one is not None]

@@ -14,6 +14,7 @@ from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, needs_keyframe
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
+from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
 from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.state.confidence import is_high_loss
 from tracking3d.estimation.online.state.solver_state import SolverState
@@ -60,6 +61,8 @@ class FrameMapping(ContinuedRefinement):
                 )
                 updated = fix_depth_reversal(updated, self.online)
                 updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
+                if self.config.masks_given:
+                    updated = measure_mask_agreement(updated)
             pose = updated.last_pose[0]
         if found.lost:
             updated = replace(updated, previous_pose=None)

@@ -56,6 +56,7 @@ from tracking3d.estimation.online.mapping.global_refinement import refine_global
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points, refine_local_map
 from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
+from tracking3d.estimation.online.masks.mask_agreement import mask_agreement, measure_mask_agreement
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
@@ -157,6 +158,9 @@ class OnlineSolver(MapExtension):
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
         )
         object_map, camera = refine_globally(state.object_map, state.camera, self.online)
+        if self.config.masks_given:
+            count = len(object_map.keyframes)
+            state = replace(state, mask_agreement=(mask_agreement(object_map, camera), count))
         return replace(
             state,
             inactive_maps=tuple(
@@ -247,6 +251,8 @@ class OnlineSolver(MapExtension):
             updated = replace(
                 state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
             )
+            if self.config.masks_given:
+                updated = measure_mask_agreement(updated)
             updated, revised = estimate_pending_frames(
                 updated, waiting, start, before, self.online, self.weights
             )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.estimation.online.masks.mask_agreement import initial_mask_weight
 from tracking3d.estimation.online.masks.mask_fusion import FusedMask, fuse_mask, update_colours
 from tracking3d.estimation.online.optimization.observability import least_constrained_axis
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
@@ -72,6 +73,7 @@ def make_estimate(
             assessment.confidence,
             state.colours,
             moving,
+            initial_mask_weight(state, fit),
         )
     return replace(
         estimate,

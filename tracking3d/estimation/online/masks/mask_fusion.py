@@ -23,6 +23,7 @@ from tracking3d.segmentation import (
     pose_weight,
     snap_to_edges,
 )
+from tracking3d.segmentation.initial_mask_agreement import STANDS
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
 
@@ -57,6 +58,7 @@ def fuse_mask(
     confidence: float,
     colours: ColourModels | None,
     moving: Callable[[], NDArray[np.float32] | None] | None = None,
+    stands: float = 0.0,
 ) -> FusedMask:
     """Fuse the silhouette and the initial mask by the evidence of the image.
 
@@ -68,9 +70,12 @@ def fuse_mask(
         colours: The colours in earlier frames, or None.
         moving: Computes the motion cue in the window of `upsampled_window`, ``(S, S)``, or None if it is unknown;
             called only if it is needed.
+        stands: How far the initial mask stands because it agrees with those of other frames, in [0, 1].
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
+    if stands >= STANDS:
+        return FusedMask(initial, MaskSource.INITIAL)
     window, image = upsampled_window(observation)
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
@@ -84,7 +89,11 @@ def fuse_mask(
         if not pose_weight(confidence):
             return FusedMask(initial, MaskSource.INITIAL)
         support = _extract(
-            image, blend_with_initial(odds, own, pose_weight(confidence)), asked, initial, window
+            image,
+            blend_with_initial(odds, own, (1 - stands) * pose_weight(confidence)),
+            asked,
+            initial,
+            window,
         )
     # The window is the initial mask's: beyond it the silhouette of a reliable pose defines the object alone.
     beyond = rendered if share or pose_weight(confidence) == 1 else initial

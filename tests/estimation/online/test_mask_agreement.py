@@ -1,0 +1,70 @@
+"""Masks of keyframes that are exact agree with each other, and stand in the frames after them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from online_runs import FRAMES, known_run, solver, turning_clip
+
+from tracking3d.estimation.estimate import MaskSource
+from tracking3d.estimation.online.masks.mask_agreement import (
+    initial_mask_weight,
+    mask_agreement,
+    measure_mask_agreement,
+)
+from tracking3d.estimation.online.masks.mask_fusion import fuse_mask
+from tracking3d.estimation.online.optimization.types import PoseFit
+
+
+def test_exact_masks_of_keyframes_agree():
+    state, _ = known_run(FRAMES)
+    assert len(state.object_map.keyframes) >= 4
+    assert mask_agreement(state.object_map, state.camera) > 0.9
+
+
+def test_masks_with_background_on_another_side_each_do_not():
+    state, _ = known_run(FRAMES)
+    spoiled = tuple(
+        replace(view, mask=view.mask | np.roll(view.mask, (-1) ** number * 6, number % 2))
+        for number, view in enumerate(state.object_map.keyframes)
+    )
+    assert mask_agreement(replace(state.object_map, keyframes=spoiled), state.camera) < 0.1
+
+
+def test_it_is_measured_again_when_there_are_half_as_many_keyframes_more():
+    state, _ = known_run(FRAMES)
+    count = len(state.object_map.keyframes)
+    weight, measured = measure_mask_agreement(state).mask_agreement
+    assert (weight > 0.9, measured) == (True, count)
+    just_now = replace(state, mask_agreement=(0.3, count))
+    assert measure_mask_agreement(just_now) is just_now
+    earlier = replace(state, mask_agreement=(0.3, count // 2))
+    assert measure_mask_agreement(earlier).mask_agreement == (weight, count)
+
+
+@pytest.mark.parametrize(("missed", "weight"), [(0.0, 1.0), (0.05, 1.0), (0.1, 0.5), (0.3, 0.0)])
+def test_a_mask_further_from_the_silhouette_than_usual_has_less_weight(missed, weight):
+    state = replace(known_run(FRAMES)[0], mask_agreement=(1.0, 4))
+    overlap = state.baseline.overlap - missed
+    fit = PoseFit(state.last_pose[0], 0.1, 0.1, 0.1, 0.1, overlap, 0.0, torch.eye(6), 1)
+    assert initial_mask_weight(state, fit) == pytest.approx(weight)
+
+
+def test_a_mask_that_stands_is_not_redrawn():
+    view = known_run(FRAMES)[0].object_map.keyframes[-1]
+    silhouette = np.roll(view.mask, 4, 0)
+    stands, redrawn = (
+        fuse_mask(silhouette, view.mask, view.observation, 0.9, None, None, one) for one in (1.0, 0.0)
+    )
+    assert stands.source is MaskSource.INITIAL
+    np.testing.assert_array_equal(stands.mask, view.mask)
+    assert (redrawn.mask != view.mask).any()
+
+
+def test_only_masks_that_the_user_gives_are_asked():
+    assert not solver().config.masks_given
+    assert known_run(FRAMES)[0].mask_agreement == (0.0, 0)
+    assert turning_clip().masks[0].any()

@@ -1,0 +1,58 @@
+"""How far the masks that the user gives agree with each other, from the keyframes of the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tracking3d.estimation.online.optimization.types import PoseFit
+from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.geometry.camera import Camera
+from tracking3d.segmentation.frame_window import Answered, FrameWindow
+from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
+from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
+
+_MOST_KEYFRAMES = 16
+_GROWTH = 1.5
+"""The agreement is measured again when there are so many times more keyframes: each time costs .2 s."""
+
+_USUAL, _ANOTHER = 0.05, 0.15
+"""How far the IoU of mask and silhouette may be below the usual one; from the second on the mask is another thing's."""
+
+
+def measure_mask_agreement(state: SolverState) -> SolverState:
+    """The state with the agreement of its keyframes' masks, if there are enough more of these than the last time."""
+    _, measured = state.mask_agreement
+    count = len(state.object_map.keyframes)
+    if not measured <= count < max(_GROWTH * measured, 1):
+        weight = mask_agreement(state.object_map, state.camera)
+        return replace(state, mask_agreement=(weight, count))
+    return state
+
+
+def initial_mask_weight(state: SolverState, fit: PoseFit) -> float:
+    """The weight of a frame's initial mask, in [0, 1]: less if it is further from the silhouette than is usual."""
+    missed = state.baseline.overlap - fit.overlap
+    return state.mask_agreement[0] * float(np.clip((_ANOTHER - missed) / (_ANOTHER - _USUAL), 0, 1))
+
+
+def mask_agreement(object_map: ObjectMap, camera: Camera) -> float:
+    """The weight of initial masks in [0, 1]; see `tracking3d.segmentation.initial_mask_agreement`."""
+    vertices = object_map.vertices.cpu().numpy().astype(np.float64)
+    faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
+    views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
+    places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
+    found = InitialMaskAgreement(SoftVisualHull(vertices))
+    for view in (views[place] for place in places):
+        assert view.mask is not None
+        image = np.zeros((*view.mask.shape, 3), np.uint8)
+        T_cam_obj = view.pose.matrix().numpy().astype(np.float64)
+        scene = FrameWindow.of(
+            Answered(view.index, image, view.mask, view.mask, T_cam_obj, 1.0), camera, vertices, faces
+        )
+        if scene is not None:
+            found.see(scene)
+    found.settle()
+    return found.weight
