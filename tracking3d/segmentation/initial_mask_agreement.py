@@ -33,12 +33,14 @@ class InitialMaskAgreement:
 
     Args:
         hull: An empty one of the object's surface.
+        slack: By how much more masks may differ than with refined poses; causal ones are less exact.
 
     Attributes:
         weight: In [0, 1]; 0 before `settle`.
     """
 
     hull: SoftVisualHull
+    slack: float = 1.0
     weight: float = field(default=0.0, init=False)
     _scenes: list[FrameWindow] = field(default_factory=list, init=False)
 
@@ -57,12 +59,13 @@ class InitialMaskAgreement:
         differences = [self._difference(self._scenes[place]) for place in places]
         self._scenes = []
         known = [one for one in differences if one is not None]
-        self.weight = _falling(float(np.median(known)), _AGREE, _DIFFER) if known else 0.0
+        if known:
+            self.weight = _falling(float(np.median(known)) / self.slack, _AGREE, _DIFFER)
 
     def of_frame(self, scene: FrameWindow) -> float:
         """The weight of a frame's initial mask, in [0, 1]: less if it has another outline than the others."""
         difference = self._difference(scene) if self.weight else None
-        return 0.0 if difference is None else self.weight * _falling(difference, *_ANOTHER)
+        return 0.0 if difference is None else self.weight * _falling(difference / self.slack, *_ANOTHER)
 
     def _difference(self, scene: FrameWindow) -> float | None:
         """Of an initial mask's outline from that of the hull; None if there is no hull."""

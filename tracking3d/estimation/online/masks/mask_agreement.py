@@ -18,6 +18,7 @@ _MOST_KEYFRAMES = 16
 _GROWTH = 1.5
 """The agreement is measured again when there are so many times more keyframes: each time costs .2 s."""
 
+_SLACK = 1.25
 _USUAL, _ANOTHER = 0.05, 0.15
 """How far the IoU of mask and silhouette may be below the usual one; from the second on the mask is another thing's."""
 
@@ -44,7 +45,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> float:
     faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
     views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
     places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
-    found = InitialMaskAgreement(SoftVisualHull(vertices))
+    found = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK)
     for view in (views[place] for place in places):
         assert view.mask is not None
         image = np.zeros((*view.mask.shape, 3), np.uint8)
