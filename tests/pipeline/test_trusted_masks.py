@@ -24,12 +24,12 @@ def clip() -> SyntheticClip:
 
 @pytest.fixture
 def rough(clip, tmp_path):
-    """A folder of masks that lack a strip at the bottom."""
+    """A folder of masks that lack a strip at the bottom, another in every second frame."""
     (tmp_path / "masks").mkdir()
     for index, mask in enumerate(clip.masks):
         lowest = np.flatnonzero(mask.any(1))[-1]
         write_mask(
-            tmp_path / "masks" / f"{index:03d}.png", mask & (np.arange(len(mask)) < lowest - 2)[:, None]
+            tmp_path / "masks" / f"{index:03d}.png", mask & (np.arange(len(mask)) < lowest - 2 - 6 * (index % 2))[:, None]
         )
     return tmp_path / "masks"
 
