@@ -29,7 +29,8 @@ def rough(clip, tmp_path):
     for index, mask in enumerate(clip.masks):
         lowest = np.flatnonzero(mask.any(1))[-1]
         write_mask(
-            tmp_path / "masks" / f"{index:03d}.png", mask & (np.arange(len(mask)) < lowest - 2 - 6 * (index % 2))[:, None]
+            tmp_path / "masks" / f"{index:03d}.png",
+            mask & (np.arange(len(mask)) < lowest - 2 - 6 * (index % 2))[:, None],
         )
     return tmp_path / "masks"
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, surface_in
-from tracking3d.segmentation.initial_mask_agreement import STANDS, InitialMaskAgreement
+from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT, InitialMaskAgreement
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.whole_video import VideoSegmenter, segment_all
 
@@ -66,7 +66,7 @@ def scene_of(one: Answered) -> FrameWindow:
 
 
 def test_exact_masks_stand_though_the_surface_is_a_ball():
-    assert agreement(frames()).weight >= STANDS
+    assert agreement(frames()).weight >= KEEP_WEIGHT
 
 
 def test_masks_that_differ_from_frame_to_frame_do_not():
@@ -82,7 +82,7 @@ def test_a_single_mask_unlike_the_others_does_not_stand():
     given = frames()
     found = agreement(given)
     other = replace(given[5], initial=np.roll(given[5].initial, 9, 0))
-    assert found.of_frame(scene_of(given[4])) >= STANDS
+    assert found.of_frame(scene_of(given[4])) >= KEEP_WEIGHT
     assert found.of_frame(scene_of(other)) < 0.5
 
 
@@ -93,7 +93,7 @@ def test_exact_masks_come_back_from_the_whole_video():
         np.asarray(BALL.vertices, np.float64),
         np.asarray(BALL.faces, np.int64),
         {one.index: one.confidence for one in given},
-        given=True,
+        has_given_masks=True,
     )
     for one in given:
         known.see(one)

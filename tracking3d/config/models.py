@@ -255,6 +255,6 @@ class PipelineConfig(Section):
     runtime: RuntimeConfig = RuntimeConfig()
 
     @property
-    def masks_given(self) -> bool:
+    def has_given_masks(self) -> bool:
         """Whether the user gives the initial masks of all frames."""
         return self.tracker.name == "precomputed"

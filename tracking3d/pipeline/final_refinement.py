@@ -137,7 +137,7 @@ class FinalRefinement:
                 self._last.adjust_all()
             self._estimates.together += watch.times
             if self._session.config.object.segments_again:
-                self._last.begin_masks(self._session.config.masks_given)
+                self._last.begin_masks(self._session.config.has_given_masks)
         self._writer.refine_camera(self._last.look.camera)
 
     def _write_precomputed(self, precomputed: PrecomputedRefinement) -> None:

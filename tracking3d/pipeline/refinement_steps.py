@@ -138,17 +138,17 @@ class RefinementSteps:
         judged = () if support is None else assess_estimate(record, support)
         return adjusted_record(record, T_cam_obj, *judged)
 
-    def begin_masks(self, given: bool) -> None:
+    def begin_masks(self, has_given_masks: bool) -> None:
         """Begin with the masks; which poses are reliable is taken from the estimates as they are now.
 
         Args:
-            given: Whether the user gives the initial masks.
+            has_given_masks: Whether the user gives the initial masks.
         """
         known = {one.index: one.confidence for one in self._estimates.all() if _has_pose(one)}
         pinhole = replace(self.look.camera, lens=None)
         due = None if self._earlier is None else self._earlier.near
         self.masks = VideoSegmenter(
-            pinhole, self.look.vertices_of_landmarks, self.look.faces, known, due, given
+            pinhole, self.look.vertices_of_landmarks, self.look.faces, known, due, has_given_masks
         )
 
     def collect_mask(self, frame: Frame) -> None:

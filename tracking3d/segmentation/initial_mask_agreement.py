@@ -1,4 +1,4 @@
-"""How far given masks stand because they agree with each other.
+"""How far given masks are kept because they agree with each other.
 
 Exact masks are silhouettes of one object: their visual hull, rendered in each frame, has their outlines, also where the
 surface cannot follow the object. Masks that miss parts or take in background differ from frame to frame, and their hull
@@ -16,8 +16,8 @@ from tracking3d.segmentation.colour_models import outline_difference, relative_d
 from tracking3d.segmentation.frame_window import FrameWindow
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 
-STANDS = 0.9
-"""Weight from which an initial mask stands as it is."""
+KEEP_WEIGHT = 0.9
+"""Weight from which an initial mask is kept as it is."""
 _MOST_FRAMES = 24
 """Frames in which the hull is compared, spread over those that it was made from."""
 _AGREE, _DIFFER = 0.018, 0.026

@@ -20,7 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
-from tracking3d.segmentation.initial_mask_agreement import STANDS, InitialMaskAgreement
+from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT, InitialMaskAgreement
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
@@ -63,7 +63,7 @@ class VideoSegmenter:
         faces: ``(F, 3)``.
         confidences: Of the frames that have a pose, by index.
         due: Indices of the frames that are decided; all if None.
-        given: Whether the user gives the initial masks: they stand if they agree with each other.
+        has_given_masks: Whether the user gives the initial masks: they are kept if they agree with each other.
 
     Attributes:
         order: The latest frames of the second time.
@@ -76,7 +76,7 @@ class VideoSegmenter:
         faces: NDArray[np.int64],
         confidences: dict[int, float],
         due: Collection[int] | None = None,
-        given: bool = False,
+        has_given_masks: bool = False,
     ) -> None:
         self._camera, self._vertices, self._faces = camera, vertices, faces
         self._due = due
@@ -85,7 +85,7 @@ class VideoSegmenter:
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}
         self._consensus = SoftVisualHull(vertices)
-        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices)) if given else None
+        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices)) if has_given_masks else None
         self._colours: ColourModels | None = None
         self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
         self._jobs: OrderedExecutor | None = None
@@ -168,10 +168,10 @@ class VideoSegmenter:
         if asked is None:
             return frame.index, None
         scene, said = asked
-        stands = 0.0 if self._agreement is None else self._agreement.of_frame(scene)
-        if stands >= STANDS:
+        initial_weight = 0.0 if self._agreement is None else self._agreement.of_frame(scene)
+        if initial_weight >= KEEP_WEIGHT:
             return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
-        weight = (1 - stands) * pose_weight(frame.confidence)
+        weight = (1 - initial_weight) * pose_weight(frame.confidence)
         odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, weight)
         support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)

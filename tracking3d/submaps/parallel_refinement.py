@@ -116,7 +116,7 @@ def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
     """
     estimates = _estimates(job.job.folder, job.look.camera)
     last = RefinementSteps(estimates, job.look)
-    last.begin_masks(job.job.config.masks_given)  # before poses are adjusted, as in one process
+    last.begin_masks(job.job.config.has_given_masks)  # before poses are adjusted, as in one process
     for record in job.estimates.values():
         estimates.put(record)
     for frame in _frames(job.job.source, job.job.whole, estimates):

@@ -65,6 +65,6 @@ def test_a_mask_that_stands_is_not_redrawn():
 
 
 def test_only_masks_that_the_user_gives_are_asked():
-    assert not solver().config.masks_given
+    assert not solver().config.has_given_masks
     assert known_run(FRAMES)[0].mask_agreement == (0.0, 0)
     assert turning_clip().masks[0].any()

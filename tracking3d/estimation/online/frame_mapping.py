@@ -61,7 +61,7 @@ class FrameMapping(ContinuedRefinement):
                 )
                 updated = fix_depth_reversal(updated, self.online)
                 updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
-                if self.config.masks_given:
+                if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)
             pose = updated.last_pose[0]
         if found.lost:

@@ -158,7 +158,7 @@ class OnlineSolver(MapExtension):
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
         )
         object_map, camera = refine_globally(state.object_map, state.camera, self.online)
-        if self.config.masks_given:
+        if self.config.has_given_masks:
             count = len(object_map.keyframes)
             state = replace(state, mask_agreement=(mask_agreement(object_map, camera), count))
         return replace(
@@ -251,7 +251,7 @@ class OnlineSolver(MapExtension):
             updated = replace(
                 state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
             )
-            if self.config.masks_given:
+            if self.config.has_given_masks:
                 updated = measure_mask_agreement(updated)
             updated, revised = estimate_pending_frames(
                 updated, waiting, start, before, self.online, self.weights

@@ -17,8 +17,8 @@ from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 _MOST_KEYFRAMES = 16
 _GROWTH = 1.5
 """The agreement is measured again when there are so many times more keyframes: each time costs .2 s."""
-
 _SLACK = 1.25
+"""Causal poses are less exact than refined ones, and masks differ more from their hull."""
 _USUAL, _ANOTHER = 0.05, 0.15
 """How far the IoU of mask and silhouette may be below the usual one; from the second on the mask is another thing's."""
 

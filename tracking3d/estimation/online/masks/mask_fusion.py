@@ -23,7 +23,7 @@ from tracking3d.segmentation import (
     pose_weight,
     snap_to_edges,
 )
-from tracking3d.segmentation.initial_mask_agreement import STANDS
+from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
 
@@ -58,7 +58,7 @@ def fuse_mask(
     confidence: float,
     colours: ColourModels | None,
     moving: Callable[[], NDArray[np.float32] | None] | None = None,
-    stands: float = 0.0,
+    initial_weight: float = 0.0,
 ) -> FusedMask:
     """Fuse the silhouette and the initial mask by the evidence of the image.
 
@@ -70,11 +70,11 @@ def fuse_mask(
         colours: The colours in earlier frames, or None.
         moving: Computes the motion cue in the window of `upsampled_window`, ``(S, S)``, or None if it is unknown;
             called only if it is needed.
-        stands: How far the initial mask stands because it agrees with those of other frames, in [0, 1].
+        initial_weight: How far the initial mask is kept because it agrees with those of other frames, in [0, 1].
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
-    if stands >= STANDS:
+    if initial_weight >= KEEP_WEIGHT:
         return FusedMask(initial, MaskSource.INITIAL)
     window, image = upsampled_window(observation)
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
@@ -90,7 +90,7 @@ def fuse_mask(
             return FusedMask(initial, MaskSource.INITIAL)
         support = _extract(
             image,
-            blend_with_initial(odds, own, (1 - stands) * pose_weight(confidence)),
+            blend_with_initial(odds, own, (1 - initial_weight) * pose_weight(confidence)),
             asked,
             initial,
             window,

@@ -85,7 +85,7 @@ class SolverState:
         unaligned: Whether the transform from the active map to the first one is only a guess.
         reversal_attempt: How many keyframes there were, and how many degrees they spanned, when a depth reversal was
             last tried.
-        mask_agreement: How far the initial masks stand because those of the keyframes agree with each other, in [0, 1],
+        mask_agreement: How far initial masks are kept because those of the keyframes agree with each other, in [0, 1],
             and how many keyframes there were when that was measured.
         extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
             explain, by frame index.
