@@ -17,12 +17,13 @@ from tracking3d.estimation.online.masks.mask_agreement import (
 )
 from tracking3d.estimation.online.masks.mask_fusion import fuse_mask
 from tracking3d.estimation.online.optimization.types import PoseFit
+from tracking3d.estimation.online.state.solver_state import MaskAgreement
 
 
 def test_exact_masks_of_keyframes_agree():
     state, _ = known_run(FRAMES)
     assert len(state.object_map.keyframes) >= 4
-    assert mask_agreement(state.object_map, state.camera) > 0.9
+    assert mask_agreement(state.object_map, state.camera).weight > 0.9
 
 
 def test_masks_with_background_on_another_side_each_do_not():
@@ -31,24 +32,24 @@ def test_masks_with_background_on_another_side_each_do_not():
         replace(view, mask=view.mask | np.roll(view.mask, (-1) ** number * 6, number % 2))
         for number, view in enumerate(state.object_map.keyframes)
     )
-    assert mask_agreement(replace(state.object_map, keyframes=spoiled), state.camera) < 0.1
+    assert mask_agreement(replace(state.object_map, keyframes=spoiled), state.camera).weight < 0.1
 
 
 def test_it_is_measured_again_when_there_are_half_as_many_keyframes_more():
     state, _ = known_run(FRAMES)
     count = len(state.object_map.keyframes)
-    weight, measured = measure_mask_agreement(state).mask_agreement
-    assert (weight > 0.9, measured) == (True, count)
-    just_now = replace(state, mask_agreement=(0.3, count))
+    found = measure_mask_agreement(state).mask_agreement
+    assert found.weight > 0.9 and found.overlap > 0.9 and found.keyframes == count
+    just_now = replace(state, mask_agreement=replace(found, weight=0.3))
     assert measure_mask_agreement(just_now) is just_now
-    earlier = replace(state, mask_agreement=(0.3, count // 2))
-    assert measure_mask_agreement(earlier).mask_agreement == (weight, count)
+    earlier = replace(state, mask_agreement=MaskAgreement(0.3, 0.5, count // 2))
+    assert measure_mask_agreement(earlier).mask_agreement == found
 
 
 @pytest.mark.parametrize(("missed", "weight"), [(0.0, 1.0), (0.05, 1.0), (0.1, 0.5), (0.3, 0.0)])
 def test_a_mask_further_from_the_silhouette_than_usual_has_less_weight(missed, weight):
-    state = replace(known_run(FRAMES)[0], mask_agreement=(1.0, 4))
-    overlap = state.baseline.overlap - missed
+    state = replace(known_run(FRAMES)[0], mask_agreement=MaskAgreement(1.0, 0.7, 4))
+    overlap = 0.7 - missed  # this surface reaches .7, whatever is usual elsewhere
     fit = PoseFit(state.last_pose[0], 0.1, 0.1, 0.1, 0.1, overlap, 0.0, torch.eye(6), 1)
     assert initial_mask_weight(state, fit) == pytest.approx(weight)
 
@@ -66,5 +67,5 @@ def test_a_mask_that_stands_is_not_redrawn():
 
 def test_only_masks_that_the_user_gives_are_asked():
     assert not solver().config.has_given_masks
-    assert known_run(FRAMES)[0].mask_agreement == (0.0, 0)
+    assert known_run(FRAMES)[0].mask_agreement == MaskAgreement()
     assert turning_clip().masks[0].any()

@@ -159,8 +159,7 @@ class OnlineSolver(MapExtension):
         )
         object_map, camera = refine_globally(state.object_map, state.camera, self.online)
         if self.config.has_given_masks:
-            count = len(object_map.keyframes)
-            state = replace(state, mask_agreement=(mask_agreement(object_map, camera), count))
+            state = replace(state, mask_agreement=mask_agreement(object_map, camera))
         return replace(
             state,
             inactive_maps=tuple(

@@ -8,7 +8,7 @@ import numpy as np
 
 from tracking3d.estimation.online.optimization.types import PoseFit
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import MaskAgreement, SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.segmentation.frame_window import Answered, FrameWindow
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
@@ -25,27 +25,25 @@ _USUAL, _ANOTHER = 0.05, 0.15
 
 def measure_mask_agreement(state: SolverState) -> SolverState:
     """The state with the agreement of its keyframes' masks, if there are enough more of these than the last time."""
-    _, measured = state.mask_agreement
-    count = len(state.object_map.keyframes)
-    if not measured <= count < max(_GROWTH * measured, 1):
-        weight = mask_agreement(state.object_map, state.camera)
-        return replace(state, mask_agreement=(weight, count))
-    return state
+    measured, count = state.mask_agreement.keyframes, len(state.object_map.keyframes)
+    if measured <= count < max(_GROWTH * measured, 1):
+        return state
+    return replace(state, mask_agreement=mask_agreement(state.object_map, state.camera))
 
 
 def initial_mask_weight(state: SolverState, fit: PoseFit) -> float:
     """The weight of a frame's initial mask, in [0, 1]: less if it is further from the silhouette than is usual."""
-    missed = state.baseline.overlap - fit.overlap
-    return state.mask_agreement[0] * float(np.clip((_ANOTHER - missed) / (_ANOTHER - _USUAL), 0, 1))
+    missed = min(state.baseline.overlap, state.mask_agreement.overlap) - fit.overlap
+    return state.mask_agreement.weight * float(np.clip((_ANOTHER - missed) / (_ANOTHER - _USUAL), 0, 1))
 
 
-def mask_agreement(object_map: ObjectMap, camera: Camera) -> float:
-    """The weight of initial masks in [0, 1]; see `tracking3d.segmentation.initial_mask_agreement`."""
+def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
+    """The agreement of the keyframes' masks; see `tracking3d.segmentation.initial_mask_agreement`."""
     vertices = object_map.vertices.cpu().numpy().astype(np.float64)
     faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
     views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
     places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
-    found = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK)
+    found, overlaps = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK), list[float]()
     for view in (views[place] for place in places):
         assert view.mask is not None
         image = np.zeros((*view.mask.shape, 3), np.uint8)
@@ -55,5 +53,8 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> float:
         )
         if scene is not None:
             found.see(scene)
+            either = np.count_nonzero(scene.initial | scene.drawn)
+            overlaps.append(np.count_nonzero(scene.initial & scene.drawn) / either)
     found.settle()
-    return found.weight
+    overlap = float(np.median(overlaps)) if overlaps else 1.0
+    return MaskAgreement(found.weight, overlap, len(object_map.keyframes))

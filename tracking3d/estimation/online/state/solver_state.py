@@ -52,6 +52,21 @@ class InactiveMap:
     unaligned: bool
 
 
+@dataclass(frozen=True)
+class MaskAgreement:
+    """How far the initial masks of the keyframes agree with each other.
+
+    Attributes:
+        weight: Of initial masks because of that, in [0, 1].
+        overlap: Median IoU of a keyframe's initial mask and its silhouette.
+        keyframes: How many there were when that was measured.
+    """
+
+    weight: float = 0.0
+    overlap: float = 1.0
+    keyframes: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class SolverState:
     """What the solver knows between two frames.
@@ -85,8 +100,7 @@ class SolverState:
         unaligned: Whether the transform from the active map to the first one is only a guess.
         reversal_attempt: How many keyframes there were, and how many degrees they spanned, when a depth reversal was
             last tried.
-        mask_agreement: How far initial masks are kept because those of the keyframes agree with each other, in [0, 1],
-            and how many keyframes there were when that was measured.
+        mask_agreement: How far the initial masks of the keyframes agree with each other.
         extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
             explain, by frame index.
     """
@@ -117,7 +131,7 @@ class SolverState:
     active_since: int = -1
     unaligned: bool = False
     reversal_attempt: tuple[int, float] = (0, 0.0)
-    mask_agreement: tuple[float, int] = (0.0, 0)
+    mask_agreement: MaskAgreement = MaskAgreement()
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
@@ -138,6 +152,7 @@ class SolverState:
 
 ONLINE_CLASSES = (
     InactiveMap,
+    MaskAgreement,
     SolverState,
     ColourModels,
     MotionReference,
