@@ -164,13 +164,13 @@ class VideoSegmenter:
             return frame.index, None
         if not pose_weight(frame.confidence):
             return frame.index, None
+        initial_weight = self._initial_weight(frame)
+        if initial_weight >= KEEP_WEIGHT:
+            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
         asked = self.said(frame, order)
         if asked is None:
             return frame.index, None
         scene, said = asked
-        initial_weight = 0.0 if self._agreement is None else self._agreement.of_frame(scene)
-        if initial_weight >= KEEP_WEIGHT:
-            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
         weight = (1 - initial_weight) * pose_weight(frame.confidence)
         odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, weight)
         support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
@@ -183,6 +183,13 @@ class VideoSegmenter:
         if common < (1 - _MOST_CHANGE) * either:
             return frame.index, None
         return frame.index, SegmentedMask(frame.index, mask, 0.5 + 0.5 * full)
+
+    def _initial_weight(self, frame: Answered) -> float:
+        """The weight of an initial mask because it agrees with those of other frames; 0 if the user gave none."""
+        if self._agreement is None or not frame.initial.any() or not np.isfinite(frame.T_cam_obj).all():
+            return 0.0
+        scene = self._scene(frame)
+        return 0.0 if scene is None or not scene.initial.any() else self._agreement.of_frame(scene)
 
 
 def segment_all(
