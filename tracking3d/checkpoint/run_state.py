@@ -52,6 +52,9 @@ class RunState:
     ) -> None:
         """Take one step; the state is saved after the first one, then after every `SAVED_EVERY`-th.
 
+        It is saved at once if earlier frames have other estimates: their masks are written over, and an earlier state
+        would be of masks that are gone.
+
         Args:
             session: The session's state.
             taken: The frame that was taken for the first time, if it was one.
@@ -68,7 +71,7 @@ class RunState:
             self.checkpoint.note(taken)
         self._unsaved = session
         self._revised.update(revised)
-        if self._steps % SAVED_EVERY == 0 or self.checkpoint.rollback_point_due:
+        if self._revised or self._steps % SAVED_EVERY == 0 or self.checkpoint.rollback_point_due:
             self.save()
         self._steps += 1
 

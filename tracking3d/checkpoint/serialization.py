@@ -222,7 +222,7 @@ class TreeFolder:
         return arrays.read(name, arrays.header(name).nbytes)
 
     def _reserve(self, size: int, expected: int) -> None:
-        """Count what an array takes beyond what is ``expected`` of its file; only rollback points are compressed."""
+        """Count what an array takes beyond what is ``expected`` of its file; earlier versions compressed some."""
         self._left -= max(size - expected, 0)
         if self._left < 0:
             raise ValueError("its arrays take more memory than those of a state")

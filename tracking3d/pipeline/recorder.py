@@ -301,7 +301,7 @@ class ObjectRecorder:
     def give_up(self, error: BaseException) -> None:
         """Save the finished frames when ``error`` ends the run, and add this to ``error``."""
         self._work.end()
-        with suppress(OutputError):  # the first error is reported
+        with suppress(Exception):  # the first error is reported
             self._state.save()
         failed = isinstance(error, Exception)
         folder = self._writer.folder

@@ -195,8 +195,10 @@ class RefinementSteps:
         frame = self._waiting.pop(index)
         if decided is None or index in self._fixed or not self._estimates.estimate(index).refined:
             return frame, None
-        lens = self.look.camera.lens
-        if lens is not None:
+        lens, initial = self.look.camera.lens, self._estimates.initial_mask(index)
+        if decided.is_initial and initial is not None:  # without a way through the pinhole camera and back
+            decided = SegmentedMask(index, initial, initial.astype(np.float32), is_initial=True)
+        elif lens is not None:
             probability = lens.mask_to_picture(decided.probability)
             decided = SegmentedMask(index, probability > 0.5, probability)
         return frame, decided

@@ -81,7 +81,7 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
 
 def needs_prompt(config: PipelineConfig) -> bool:
     """Whether the user must prompt the object: neither masks of all frames nor a known object replace the prompt."""
-    return not config.has_given_masks and config.object.model is None
+    return config.tracker.name != "precomputed" and config.object.model is None
 
 
 def check_single_known_object(config: PipelineConfig, objects: int) -> None:

@@ -1,4 +1,4 @@
-"""Writing a run folder during the run, so that a kill loses at most the current frame.
+"""Writing a run folder during the run, so that a kill loses at most the frames since the last saved state.
 
 A frame's masks are renamed into place before its line is appended to ``frames.jsonl``: the line says that the
 frame is there. The writer holds a lock on ``frames.jsonl``, which the system drops with the process.

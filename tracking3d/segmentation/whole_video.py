@@ -47,11 +47,13 @@ class SegmentedMask:
         index: The index of the frame.
         mask: ``(H, W)``.
         probability: ``(H, W)`` of the object; the mask is where it is above a half.
+        is_initial: Whether it is the initial mask as it was.
     """
 
     index: int
     mask: Mask
     probability: Plane
+    is_initial: bool = False
 
 
 class VideoSegmenter:
@@ -166,7 +168,9 @@ class VideoSegmenter:
             return frame.index, None
         initial_weight = self._initial_weight(frame)
         if initial_weight >= KEEP_WEIGHT:
-            return frame.index, SegmentedMask(frame.index, frame.initial, frame.initial.astype(np.float32))
+            return frame.index, SegmentedMask(
+                frame.index, frame.initial, frame.initial.astype(np.float32), is_initial=True
+            )
         asked = self.said(frame, order)
         if asked is None:
             return frame.index, None

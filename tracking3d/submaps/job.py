@@ -49,7 +49,7 @@ class LongVideo:
     @property
     def precomputed(self) -> bool:
         """Whether masks of all frames are given."""
-        return self.config.has_given_masks
+        return self.config.tracker.name == "precomputed"
 
     def frames(self, count: int) -> range:
         """Indices of the ``count`` selected frames."""

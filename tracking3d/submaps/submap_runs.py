@@ -79,6 +79,8 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
     if not ((folder / layout.RUN).is_file() and layout.has_state(folder)):
         return False
     run = RunReader(folder, refined=False)
+    if run.state == "failed":  # its last state may be some frames behind
+        return False
     return len(run.frames) + len(run.description["skipped"]) == source.count
 
 

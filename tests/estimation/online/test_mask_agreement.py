@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from online_runs import FRAMES, known_run, solver, turning_clip
+from online_runs import FRAMES, estimate_of, known_run, true_mask, turning_clip, with_true_masks
 
+from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import MaskSource
 from tracking3d.estimation.online.masks.mask_agreement import (
     initial_mask_weight,
@@ -17,7 +18,9 @@ from tracking3d.estimation.online.masks.mask_agreement import (
 )
 from tracking3d.estimation.online.masks.mask_fusion import fuse_mask
 from tracking3d.estimation.online.optimization.types import PoseFit
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import MaskAgreement
+from tracking3d.features.rgb import RgbEncoder
 
 
 def test_exact_masks_of_keyframes_agree():
@@ -65,7 +68,22 @@ def test_a_mask_that_stands_is_not_redrawn():
     assert (redrawn.mask != view.mask).any()
 
 
-def test_only_masks_that_the_user_gives_are_asked():
-    assert not solver().config.has_given_masks
-    assert known_run(FRAMES)[0].mask_agreement == MaskAgreement()
-    assert turning_clip().masks[0].any()
+def test_boxes_in_a_text_file_are_no_masks():
+    for path, given in (("masks", True), ("masks.npz", True), ("groundtruth.txt", False)):
+        config = load_config(overrides=["tracker.name=precomputed", f"tracker.path={path}"])
+        assert config.has_given_masks == given
+    assert not load_config().has_given_masks
+
+
+def test_the_solver_measures_it_for_given_masks_only():
+    config = load_config(overrides=["object.frequency=7", "tracker.name=precomputed", "tracker.path=masks"])
+    asked = OnlineSolver(config, turning_clip().camera, RgbEncoder())
+    state, estimates = None, []
+    for shown, mask in with_true_masks():
+        given = estimate_of(mask)
+        state, estimate = asked.init(shown, given) if state is None else asked.step(state, shown, given)
+        estimates.append(estimate)
+    assert state.mask_agreement.weight > 0.9
+    last = estimates[-1]
+    np.testing.assert_array_equal(last.mask, true_mask(last.index))
+    assert any((one.mask != true_mask(one.index)).any() for one in known_run(FRAMES)[1][-3:])

@@ -119,7 +119,9 @@ def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -
 def _deactivate(state: SolverState, spans: tuple[tuple[int, int], ...]) -> InactiveMap:
     """The active map as an inactive one."""
     assert state.surface is not None
-    return InactiveMap(state.object_map, state.surface, state.baseline, spans, state.unaligned)
+    return InactiveMap(
+        state.object_map, state.surface, state.baseline, spans, state.unaligned, state.mask_agreement
+    )
 
 
 def _limit_maps(aside: tuple[InactiveMap, ...]) -> tuple[InactiveMap, ...]:
@@ -221,6 +223,7 @@ def _with_active_map(
         object_map=other.object_map,
         surface=other.surface,
         baseline=other.baseline,
+        mask_agreement=other.mask_agreement,
         unaligned=other.unaligned,
         spans=other.spans,
         inactive_maps=(*(one for one in state.inactive_maps if one is not other), _deactivate(state, spans)),

@@ -53,7 +53,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
         )
         if scene is not None:
             found.see(scene)
-            either = np.count_nonzero(scene.initial | scene.drawn)
+            either = max(int(np.count_nonzero(scene.initial | scene.drawn)), 1)
             overlaps.append(np.count_nonzero(scene.initial & scene.drawn) / either)
     found.settle()
     overlap = float(np.median(overlaps)) if overlaps else 1.0

@@ -33,25 +33,6 @@ class SolverPhase(Enum):
     """It relocalizes the object, or initializes a second map."""
 
 
-@dataclass(frozen=True, eq=False)
-class InactiveMap:
-    """A map that the object is not tracked against now; its transform to the active map is unknown.
-
-    Attributes:
-        object_map: The map.
-        surface: Its surface.
-        baseline: The losses of the frames that were tracked against it.
-        spans: First and last index of the frames that were estimated with it.
-        unaligned: Whether its transform to the first map is only a guess.
-    """
-
-    object_map: ObjectMap
-    surface: Surface
-    baseline: LossBaseline
-    spans: tuple[tuple[int, int], ...]
-    unaligned: bool
-
-
 @dataclass(frozen=True)
 class MaskAgreement:
     """How far the initial masks of the keyframes agree with each other.
@@ -65,6 +46,27 @@ class MaskAgreement:
     weight: float = 0.0
     overlap: float = 1.0
     keyframes: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class InactiveMap:
+    """A map that the object is not tracked against now; its transform to the active map is unknown.
+
+    Attributes:
+        object_map: The map.
+        surface: Its surface.
+        baseline: The losses of the frames that were tracked against it.
+        spans: First and last index of the frames that were estimated with it.
+        unaligned: Whether its transform to the first map is only a guess.
+        mask_agreement: That of its keyframes.
+    """
+
+    object_map: ObjectMap
+    surface: Surface
+    baseline: LossBaseline
+    spans: tuple[tuple[int, int], ...]
+    unaligned: bool
+    mask_agreement: MaskAgreement = MaskAgreement()
 
 
 @dataclass(frozen=True, eq=False)
