@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 
-from tracking3d.points.landmark_adjustment import LandmarkScene, fit_outlines, refine_scene
+from tracking3d.points.landmark_adjustment import (
+    LandmarkScene,
+    fit_outlines,
+    refine_scene,
+    views_with_outlines,
+)
 from tracking3d.points.outline_fit import outline_of
 from tracking3d.points.view import open_view
 
@@ -60,3 +65,14 @@ def test_an_outline_is_half_way_between_pixels_inside_and_outside():
     assert outline.K[0, 0] == view.intrinsics[0] and outline.K[0, 2] == view.intrinsics[2]
     assert outline.within.tolist() == [-0.5, view.mask.shape[1] - 0.5, -0.5, view.mask.shape[0] - 0.5]
     assert np.array_equal(outline.T_cam_obj, TRUE[0])
+
+
+@pytest.mark.parametrize(
+    ("views", "fitted"), [(0, 0), (1, 1), (29, 29), (30, 30), (48, 30), (50, 30), (51, 31), (168, 101)]
+)
+def test_outlines_are_fitted_in_thirty_views_or_six_tenths_of_a_long_video(views, fitted):
+    places = views_with_outlines(views)
+    assert len(places) == fitted
+    if fitted > 1:
+        assert (places[0], places[-1]) == (0, views - 1)
+        assert np.ptp(np.diff(places)) <= 1

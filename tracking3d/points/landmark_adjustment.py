@@ -40,10 +40,8 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
-_FEW_OUTLINES, _OUTLINE_SHARE = (
-    30,
-    0.6,
-)  # the surface is fitted to those of so many views, or of that share of more
+_FEW_OUTLINES, _OUTLINE_SHARE = 30, 0.6
+"""The surface is fitted to the outlines of so many views, or of that share of more."""
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 Corners = tuple[NDArray[np.int64], Array, Array]
@@ -177,12 +175,20 @@ def is_supported(scene: LandmarkScene) -> bool:
 def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
     there = list(views.values())
-    count = min(max(_FEW_OUTLINES, round(_OUTLINE_SHARE * len(there))), len(there))
-    places = np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))
-    outlines = [outline_of(there[place]) for place in places]
+    outlines = [outline_of(there[place]) for place in views_with_outlines(len(there))]
     vertices = fit_to_outlines(scene.vertices, scene.faces, outlines)
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
     return replace(redrawn, support=scene.support)
+
+
+def views_with_outlines(count: int) -> NDArray[np.int64]:
+    """Places of the views whose outlines are fitted, evenly among ``count`` of them, ascending."""
+    most = min(max(_FEW_OUTLINES, round(_OUTLINE_SHARE * count)), count)
+    return (
+        np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+        if count
+        else np.zeros(0, np.int64)
+    )
 
 
 def _rotation_between(before: LandmarkScene, after: LandmarkScene) -> float:
