@@ -73,6 +73,21 @@ def test_masks_that_differ_from_frame_to_frame_do_not():
     assert agreement(frames(with_a_strip)).weight < 0.1
 
 
+def behind_a_bar(number: int, mask: np.ndarray) -> np.ndarray:
+    """Exact masks of a block behind a bar that passes."""
+    hidden = np.zeros_like(mask)
+    hidden[:, 40 + 8 * number : 47 + 8 * number] = True
+    return mask & ~hidden
+
+
+def test_exact_masks_behind_something_that_passes_are_kept():
+    given = frames(behind_a_bar)
+    found = agreement(given)
+    assert found.weight > 0.9
+    weights = [found.of_frame(scene_of(one)) for one in given]
+    assert np.mean(weights) > 0.8
+
+
 def test_too_few_frames_say_nothing():
     assert agreement(frames()[:3]).weight == 0
     assert agreement([]).weight == 0

@@ -118,8 +118,13 @@ def outline_difference(first: NDArray[np.float32], second: NDArray[np.float32]) 
         first: ``(S, S)`` relative distance to the one, see `relative_distance`.
         second: ``(S, S)`` to the other.
     """
-    band = np.minimum(np.abs(first), np.abs(second)) < _BAND
+    band = near_outlines(first, second)
     return float(np.abs(first - second)[band].mean()) if band.any() else None
+
+
+def near_outlines(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """``(S, S)`` what is near either of two outlines; see `outline_difference`."""
+    return np.minimum(np.abs(first), np.abs(second)) < _BAND
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

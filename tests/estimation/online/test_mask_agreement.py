@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from online_runs import FRAMES, estimate_of, known_run, true_mask, turning_clip, with_true_masks
 
 from tracking3d.config.loading import load_config
@@ -17,7 +16,6 @@ from tracking3d.estimation.online.masks.mask_agreement import (
     measure_mask_agreement,
 )
 from tracking3d.estimation.online.masks.mask_fusion import fuse_mask
-from tracking3d.estimation.online.optimization.types import PoseFit
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import MaskAgreement
 from tracking3d.features.rgb import RgbEncoder
@@ -42,19 +40,29 @@ def test_it_is_measured_again_when_there_are_half_as_many_keyframes_more():
     state, _ = known_run(FRAMES)
     count = len(state.object_map.keyframes)
     found = measure_mask_agreement(state).mask_agreement
-    assert found.weight > 0.9 and found.overlap > 0.9 and found.keyframes == count
+    assert found.weight > 0.9 and found.beyond < 0.1 and found.keyframes == count
     just_now = replace(state, mask_agreement=replace(found, weight=0.3))
     assert measure_mask_agreement(just_now) is just_now
     earlier = replace(state, mask_agreement=MaskAgreement(0.3, 0.5, count // 2))
     assert measure_mask_agreement(earlier).mask_agreement == found
 
 
-@pytest.mark.parametrize(("missed", "weight"), [(0.0, 1.0), (0.05, 1.0), (0.1, 0.5), (0.3, 0.0)])
-def test_a_mask_further_from_the_silhouette_than_usual_has_less_weight(missed, weight):
-    state = replace(known_run(FRAMES)[0], mask_agreement=MaskAgreement(1.0, 0.7, 4))
-    overlap = 0.7 - missed  # this surface reaches .7, whatever is usual elsewhere
-    fit = PoseFit(state.last_pose[0], 0.1, 0.1, 0.1, 0.1, overlap, 0.0, torch.eye(6), 1)
-    assert initial_mask_weight(state, fit) == pytest.approx(weight)
+@pytest.mark.parametrize(
+    ("beyond", "weight"), [(0, 1.0), (10, 1.0), (15, 1.0), (20, 0.5), (25, 0.0), (60, 0.0)]
+)
+def test_a_mask_that_reaches_further_beyond_the_silhouette_than_usual_has_less_weight(beyond, weight):
+    silhouette = np.arange(200) < 100
+    mask = (np.arange(200) >= beyond) & (
+        np.arange(200) < 100 + beyond
+    )  # so many of its hundred pixels beyond
+    agreement = MaskAgreement(1.0, 0.1, 4)
+    assert initial_mask_weight(agreement, mask, silhouette) == pytest.approx(weight)
+
+
+def test_what_hides_a_part_of_the_object_takes_nothing_from_the_weight():
+    silhouette = np.arange(200) < 100
+    assert initial_mask_weight(MaskAgreement(0.9, 0.0, 4), np.arange(200) < 30, silhouette) == 0.9
+    assert initial_mask_weight(MaskAgreement(0.9, 0.0, 4), np.zeros(200, bool), silhouette) == 0.9
 
 
 def test_a_mask_that_stands_is_not_redrawn():

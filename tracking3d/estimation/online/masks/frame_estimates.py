@@ -66,14 +66,15 @@ def make_estimate(
         mask = view.mask if view.mask is not None else np.zeros_like(estimate.mask)
         weighed = FusedMask(mask, MaskSource.as_initial(view.mask))
     else:
+        silhouette = state.object_map.silhouette(fit.pose, state.camera)
         weighed = fuse_mask(
-            state.object_map.silhouette(fit.pose, state.camera),
+            silhouette,
             view.mask,
             view.observation,
             assessment.confidence,
             state.colours,
             moving,
-            initial_mask_weight(state, fit),
+            0.0 if view.mask is None else initial_mask_weight(state.mask_agreement, view.mask, silhouette),
         )
     return replace(
         estimate,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tracking3d.estimation.online.optimization.types import PoseFit
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import MaskAgreement, SolverState
 from tracking3d.geometry.camera import Camera
@@ -17,10 +17,10 @@ from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 _MOST_KEYFRAMES = 16
 _GROWTH = 1.5
 """The agreement is measured again when there are so many times more keyframes: each time costs .2 s."""
-_SLACK = 1.25
+_SLACK = 1.5
 """Causal poses are less exact than refined ones, and masks differ more from their hull."""
 _USUAL, _ANOTHER = 0.05, 0.15
-"""How far the IoU of mask and silhouette may be below the usual one; from the second on the mask is another thing's."""
+"""Share of a mask that may lie beyond the silhouette above the usual one; from the second on it shows another thing."""
 
 
 def measure_mask_agreement(state: SolverState) -> SolverState:
@@ -31,10 +31,25 @@ def measure_mask_agreement(state: SolverState) -> SolverState:
     return replace(state, mask_agreement=mask_agreement(state.object_map, state.camera))
 
 
-def initial_mask_weight(state: SolverState, fit: PoseFit) -> float:
-    """The weight of a frame's initial mask, in [0, 1]: less if it is further from the silhouette than is usual."""
-    missed = min(state.baseline.overlap, state.mask_agreement.overlap) - fit.overlap
-    return state.mask_agreement.weight * float(np.clip((_ANOTHER - missed) / (_ANOTHER - _USUAL), 0, 1))
+def initial_mask_weight(
+    agreement: MaskAgreement, initial: NDArray[np.bool_], silhouette: NDArray[np.bool_]
+) -> float:
+    """The weight of a frame's initial mask, in [0, 1]: less if more of it than usual lies beyond the silhouette.
+
+    Args:
+        agreement: That of the keyframes.
+        initial: ``(H, W)`` the frame's initial mask.
+        silhouette: ``(H, W)`` at the frame's pose. What hides a part of the object takes it from the mask alone.
+    """
+    if not agreement.weight:
+        return 0.0
+    more = share_beyond(initial, silhouette) - agreement.beyond
+    return agreement.weight * float(np.clip((_ANOTHER - more) / (_ANOTHER - _USUAL), 0, 1))
+
+
+def share_beyond(mask: NDArray[np.bool_], silhouette: NDArray[np.bool_]) -> float:
+    """The share of a mask that lies beyond a silhouette of the same size; 0 of an empty mask."""
+    return np.count_nonzero(mask & ~silhouette) / max(int(np.count_nonzero(mask)), 1)
 
 
 def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
@@ -43,7 +58,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
     faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
     views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
     places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
-    found, overlaps = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK), list[float]()
+    found, beyond = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK), list[float]()
     for view in (views[place] for place in places):
         assert view.mask is not None
         image = np.zeros((*view.mask.shape, 3), np.uint8)
@@ -53,8 +68,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
         )
         if scene is not None:
             found.see(scene)
-            either = max(int(np.count_nonzero(scene.initial | scene.drawn)), 1)
-            overlaps.append(np.count_nonzero(scene.initial & scene.drawn) / either)
+            beyond.append(share_beyond(scene.initial, scene.drawn))
     found.settle()
-    overlap = float(np.median(overlaps)) if overlaps else 1.0
-    return MaskAgreement(found.weight, overlap, len(object_map.keyframes))
+    usual = float(np.median(beyond)) if beyond else 0.0
+    return MaskAgreement(found.weight, usual, len(object_map.keyframes))

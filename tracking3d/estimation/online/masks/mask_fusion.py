@@ -83,18 +83,14 @@ def fuse_mask(
     told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
+    odds = blend_with_initial(odds, own, 1 - initial_weight)
     support = _extract(image, odds, asked, initial, window)
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
     if not share:  # nothing but the silhouette speaks against the initial mask
         if not pose_weight(confidence):
             return FusedMask(initial, MaskSource.INITIAL)
-        support = _extract(
-            image,
-            blend_with_initial(odds, own, (1 - initial_weight) * pose_weight(confidence)),
-            asked,
-            initial,
-            window,
-        )
+        odds = blend_with_initial(odds, own, pose_weight(confidence))
+        support = _extract(image, odds, asked, initial, window)
     # The window is the initial mask's: beyond it the silhouette of a reliable pose defines the object alone.
     beyond = rendered if share or pose_weight(confidence) == 1 else initial
     full = paste_window(support, window, np.where(beyond, 1.0, -1.0).astype(np.float32))

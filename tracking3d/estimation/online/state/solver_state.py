@@ -39,12 +39,12 @@ class MaskAgreement:
 
     Attributes:
         weight: Of initial masks because of that, in [0, 1].
-        overlap: Median IoU of a keyframe's initial mask and its silhouette.
+        beyond: Median share of a keyframe's initial mask that lies beyond its silhouette.
         keyframes: How many there were when that was measured.
     """
 
     weight: float = 0.0
-    overlap: float = 1.0
+    beyond: float = 0.0
     keyframes: int = 0
 
 
