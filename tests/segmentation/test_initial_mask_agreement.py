@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from tracking3d.geometry.camera import Camera
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, surface_in
 from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT, InitialMaskAgreement
-from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.whole_video import VideoSegmenter, segment_all
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
@@ -50,7 +49,7 @@ def frames(spoil: Spoil = exact) -> list[Answered]:
 
 
 def agreement(given: list[Answered]) -> InitialMaskAgreement:
-    found = InitialMaskAgreement(SoftVisualHull(np.asarray(BALL.vertices, np.float64)))
+    found = InitialMaskAgreement(np.asarray(BALL.vertices, np.float64))
     for one in given:
         found.see(scene_of(one))
     found.settle()

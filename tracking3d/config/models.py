@@ -256,6 +256,6 @@ class PipelineConfig(Section):
 
     @property
     def has_given_masks(self) -> bool:
-        """Whether the user gives the initial masks of all frames; boxes in a text file are no masks."""
+        """Whether the user gives the initial masks of all frames; VOT's text files, mostly of boxes, do not count."""
         path = str(self.tracker.options.get("path", ""))
         return self.tracker.name == "precomputed" and not path.lower().endswith(".txt")

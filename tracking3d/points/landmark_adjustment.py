@@ -184,11 +184,7 @@ def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
 def views_with_outlines(count: int) -> NDArray[np.int64]:
     """Places of the views whose outlines are fitted, evenly among ``count`` of them, ascending."""
     most = min(max(_FEW_OUTLINES, round(_OUTLINE_SHARE * count)), count)
-    return (
-        np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
-        if count
-        else np.zeros(0, np.int64)
-    )
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
 
 
 def _rotation_between(before: LandmarkScene, after: LandmarkScene) -> float:

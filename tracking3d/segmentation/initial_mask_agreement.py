@@ -9,9 +9,10 @@ the same way in all frames, as on a bowl that turns about its axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.segmentation.colour_models import near_outlines, relative_distance
 from tracking3d.segmentation.frame_window import FrameWindow
@@ -25,45 +26,43 @@ _BEYOND, _APART = (0.008, 0.013), (0.016, 0.022)
 """How far masks reach beyond the hull, in the mean along their outlines, and the median distance of both outlines,
 relative to the root of the area: up to the first value of each masks agree fully, from the second not at all. Exact
 masks of real videos reach .002 to .006 beyond and are .004 to .015 apart, those of csrt .005 to .018 and .007 to .020;
-the exact ones of a mug behind a passing bar .005 and .012."""
+the exact ones of a mug that a hand hides in part .005 and .012."""
 _BEYOND_IN_FRAME, _APART_IN_FRAME = (0.012, 0.025), (0.035, 0.06)
 """The same in a single frame: from the second values on its mask has nothing in common with the others."""
 
 
-@dataclass(eq=False)
 class InitialMaskAgreement:
     """Collects frames, then gives the weight of their initial masks.
 
     Args:
-        hull: An empty one of the object's surface.
+        vertices: ``(V, 3)`` of the object: where the hull can be.
         slack: By how much more masks may differ than with refined poses; causal ones are less exact.
 
     Attributes:
         weight: In [0, 1]; 0 before `settle`.
     """
 
-    hull: SoftVisualHull
-    slack: float = 1.0
-    weight: float = field(default=0.0, init=False)
-    _scenes: list[FrameWindow] = field(default_factory=list, init=False)
+    def __init__(self, vertices: NDArray[np.float64], slack: float = 1.0) -> None:
+        self._hull, self._slack = SoftVisualHull(vertices), slack
+        self._scenes: list[FrameWindow] = []
+        self.weight = 0.0
 
     def see(self, scene: FrameWindow) -> None:
         """Add a frame whose pose is reliable."""
         if scene.initial.any():
-            self.hull.see(replace(scene, answer=scene.initial))
+            self._hull.see(replace(scene, answer=scene.initial))
             self._scenes.append(replace(scene, image=np.zeros((0, 0, 3), np.uint8)))
 
     def settle(self) -> None:
         """All frames are there: compute the weight."""
-        self.hull.settle()
-        places = (
-            np.linspace(0, len(self._scenes) - 1, min(_MOST_FRAMES, len(self._scenes))).round().astype(int)
-        )
+        self._hull.settle()
+        count = len(self._scenes)
+        places = np.linspace(0, count - 1, min(_MOST_FRAMES, count)).round().astype(int)
         differences = [self._difference(self._scenes[place]) for place in places]
         self._scenes = []
         known = [one for one in differences if one is not None]
         if known:
-            beyond, apart = np.median(known, 0) / self.slack
+            beyond, apart = np.median(known, 0) / self._slack
             self.weight = _falling(beyond, _BEYOND) * _falling(apart, _APART)
 
     def of_frame(self, scene: FrameWindow) -> float:
@@ -71,12 +70,12 @@ class InitialMaskAgreement:
         difference = self._difference(scene) if self.weight else None
         if difference is None:
             return 0.0
-        beyond, apart = np.array(difference) / self.slack
+        beyond, apart = np.array(difference) / self._slack
         return self.weight * _falling(beyond, _BEYOND_IN_FRAME) * _falling(apart, _APART_IN_FRAME)
 
     def _difference(self, scene: FrameWindow) -> tuple[float, float] | None:
         """How far an initial mask reaches beyond the hull, and how far apart both outlines are; None without a hull."""
-        drawn = self.hull.drawn(scene)
+        drawn = self._hull.drawn(scene)
         if drawn is None:
             return None
         root = float(np.sqrt(np.count_nonzero(scene.initial)))

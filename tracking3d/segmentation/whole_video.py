@@ -87,7 +87,7 @@ class VideoSegmenter:
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}
         self._consensus = SoftVisualHull(vertices)
-        self._agreement = InitialMaskAgreement(SoftVisualHull(vertices)) if has_given_masks else None
+        self._agreement = InitialMaskAgreement(vertices) if has_given_masks else None
         self._colours: ColourModels | None = None
         self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
         self._jobs: OrderedExecutor | None = None

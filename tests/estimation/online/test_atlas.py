@@ -29,6 +29,7 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 )
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.online.state.solver_state import MaskAgreement
 from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
@@ -172,6 +173,19 @@ def test_each_frame_is_looked_at_again_with_the_map_that_answered_it():
     # Whichever map is at hand, the other is found.
     assert map_of_frame(map_of_frame(state, 2), ALONE - 1).object_map is second
     assert map_of_frame(map_of_frame(state, ALONE - 1), 2).object_map is first
+
+
+def test_each_map_has_the_agreement_of_its_own_masks():
+    state, _ = refined(ALONE)
+    here = next(
+        index for index in (2, ALONE - 1) if map_of_frame(state, index).object_map is state.object_map
+    )
+    there = ALONE + 1 - here
+    agreement = MaskAgreement(0.8, 0.1, 5)
+    state = replace(state, mask_agreement=agreement)
+    elsewhere = map_of_frame(state, there)
+    assert elsewhere.mask_agreement == MaskAgreement()
+    assert map_of_frame(elsewhere, here).mask_agreement == agreement
 
 
 @pytest.mark.parametrize("count", [BACK + 4, ALONE])

@@ -52,9 +52,7 @@ def test_it_is_measured_again_when_there_are_half_as_many_keyframes_more():
 )
 def test_a_mask_that_reaches_further_beyond_the_silhouette_than_usual_has_less_weight(beyond, weight):
     silhouette = np.arange(200) < 100
-    mask = (np.arange(200) >= beyond) & (
-        np.arange(200) < 100 + beyond
-    )  # so many of its hundred pixels beyond
+    mask = np.roll(silhouette, beyond)  # so many of its hundred pixels lie beyond
     agreement = MaskAgreement(1.0, 0.1, 4)
     assert initial_mask_weight(agreement, mask, silhouette) == pytest.approx(weight)
 

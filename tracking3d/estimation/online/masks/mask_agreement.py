@@ -12,7 +12,6 @@ from tracking3d.estimation.online.state.solver_state import MaskAgreement, Solve
 from tracking3d.geometry.camera import Camera
 from tracking3d.segmentation.frame_window import Answered, FrameWindow
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
-from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 
 _MOST_KEYFRAMES = 16
 _GROWTH = 1.5
@@ -58,7 +57,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
     faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
     views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
     places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
-    found, beyond = InitialMaskAgreement(SoftVisualHull(vertices), _SLACK), list[float]()
+    found, beyond = InitialMaskAgreement(vertices, _SLACK), list[float]()
     for view in (views[place] for place in places):
         assert view.mask is not None
         image = np.zeros((*view.mask.shape, 3), np.uint8)
