@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 """``(H, W, 3)`` uint8 RGB."""
 
+TRACKED_CONFIDENCE = 0.8
+"""Confidence from which a frame is `tracked`: the chance that its pose and mask are right is four in five or better."""
+
 Box = tuple[float, float, float, float]
 """``(x, y, width, height)`` in pixels; x and y are the left and upper edge of the box."""
 

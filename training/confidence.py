@@ -2,17 +2,23 @@
 
 ``python training/confidence.py BENCHMARK ... --evidence silhouette,features,matching`` reads every run in the folders
 ``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
-``iou_initial`` and ``recorded`` (the confidence that the run said itself), and of the online solver's runs what its
-confidence is made of (`tracking3d.estimation.online.state.confidence.confidence_features`), and of refined answers what
-landmarks say of them (`tracking3d.reconstruction.confidence.refined_confidence_features`). Without ``--evidence`` all
-losses count. A name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
+``iou_initial``, ``recorded`` (the confidence that the run said itself) and ``recorded_odds`` (the logarithm of its
+odds), and of the online solver's runs what its confidence is made of
+(`tracking3d.estimation.online.state.confidence.confidence_features`), and of refined answers what landmarks say of them
+(`tracking3d.reconstruction.confidence.refined_confidence_features`). Without ``--evidence`` all losses count. A name
+with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
+
+With ``--balance`` every folder is a group. A group counts with the root of its number of frames, so that a long clip
+does not decide alone, and the fit on all other groups is tested on each of them.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -47,11 +53,13 @@ class Judged:
 
     Attributes:
         sequence: Its sequence.
+        group: The folder of the benchmark.
         evidence: What the run knew, by name.
         right: What the truth says.
     """
 
     sequence: str
+    group: str
     evidence: dict[str, float]
     right: bool
 
@@ -80,9 +88,15 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,
+                    "recorded_odds": _log_odds(record.confidence),
                     **_of_landmarks(record),
                 }
-                yield Judged(truth.name, evidence, right[record.index])
+                yield Judged(truth.name, benchmark.name, evidence, right[record.index])
+
+
+def _log_odds(probability: float) -> float:
+    bounded = min(max(probability, 0.01), 0.99)
+    return math.log(bounded / (1 - bounded))
 
 
 def _of_tracking(record: FrameRecord) -> dict[str, float]:
@@ -109,6 +123,27 @@ def table(frames: list[Judged], names: list[str]) -> tuple[dict[str, np.ndarray]
     return evidence, np.array([one.right for one in frames], dtype=bool)
 
 
+def balanced(frames: list[Judged]) -> np.ndarray:
+    """The weight ``(N,)`` of each frame: one over the root of how many there are in its group."""
+    sizes = Counter(one.group for one in frames)
+    return np.array([1 / math.sqrt(sizes[one.group]) for one in frames])
+
+
+def test_groups(frames: list[Judged], names: list[str], signs: dict[str, int], penalty: float) -> None:
+    """Print for every group what a fit on the others is worth there."""
+    for group in sorted({one.group for one in frames}):
+        others = [one for one in frames if one.group != group]
+        fit = fit_confidence(*table(others, names), signs, penalty, balanced(others))
+        evidence, right = table([one for one in frames if one.group == group], names)
+        recorded = np.array([one.evidence["recorded"] for one in frames if one.group == group])
+        print(f"{group}: {len(right)} frames, {right.mean():.2f} right")
+        print(f"  fitted on the others: {tested(fit(evidence), right)}")
+        print(f"  recorded:             {tested(recorded, right)}")
+    everything = fit_confidence(*table(frames, names), signs, penalty, balanced(frames))
+    print("\n# fitted on all groups:")
+    print(as_python_source(everything))
+
+
 def tested(said: np.ndarray, right: np.ndarray) -> str:
     """What confidences ``(N,)`` are worth, in words."""
     error, area = expected_calibration_error(said, right), area_under_roc(said, right)
@@ -128,6 +163,9 @@ def main(words: list[str]) -> None:
     # Of refined answers what is lost is not judged by landmarks, and has none of their evidence.
     frames = [one for one in frames if any(name in one.evidence for name in names)]
     signs = {name.lstrip("+-"): 1 if name[0] == "+" else -1 for name in asked if name[:1] in ("+", "-")}
+    if options.balance:
+        test_groups(frames, names, signs, options.penalty)
+        return
     first, second = halves([one.sequence for one in frames])
     if not second:
         raise InputError("At least two sequences with finished runs are needed; give other folders.")
@@ -174,6 +212,7 @@ def _options(words: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--penalty", type=float, default=PENALTY, help="how much small coefficients are liked"
     )
+    parser.add_argument("--balance", action="store_true", help="folders are groups that count alike")
     parser.add_argument("--json", type=Path, help="write the coefficients there too")
     return parser.parse_args(words)
 

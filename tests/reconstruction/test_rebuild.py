@@ -86,8 +86,8 @@ def test_another_video_is_refused(tmp_path):
     assert len(load_model(run).texture) == 16
 
 
-@pytest.mark.parametrize("changes", [{"confidence": 0.2}, {"status": Status.LOST}])
-def test_where_no_frame_is_believed_the_mesh_stays(tmp_path, changes):
+@pytest.mark.parametrize("changes", [{"status": Status.UNCERTAIN}, {"status": Status.LOST}])
+def test_if_no_frame_is_tracked_the_mesh_stays(tmp_path, changes):
     run = written(tmp_path, **changes)
     with pytest.raises(InputError, match="its mesh stays as it is"):
         retexture_run(run)

@@ -22,9 +22,9 @@ YAWS = (0, 15, 30)
 
 
 class KnowingSolver:
-    """Answers with the truth of the ball; sure of it in the second pass only where ``confidence`` says so."""
+    """Answers with the truth of the ball; tracked or not in the second pass, as ``status`` says."""
 
-    confidence = 0.9
+    status = Status.TRACKED
 
     def __init__(self, config, camera, encoder) -> None:
         pass
@@ -47,9 +47,7 @@ class KnowingSolver:
     def _answer(self, frame: Frame) -> FrameEstimate:
         T_cam_obj = pose(YAWS[frame.index])
         mask = seen(T_cam_obj, pattern())[1]
-        return FrameEstimate(
-            frame.index, frame.time, T_cam_obj, mask, mask, Status.TRACKED, "", self.confidence
-        )
+        return FrameEstimate(frame.index, frame.time, T_cam_obj, mask, mask, self.status, "", 0.9)
 
 
 def recorded(folder: Path, *overrides: str) -> ObjectModel:
@@ -81,6 +79,6 @@ def test_settings_leave_it_out_or_bound_it(tmp_path, override):
     assert len(recorded(tmp_path, override).texture) == (64 if "max_texture_size" in override else 16)
 
 
-def test_frames_that_are_not_believed_have_no_say(tmp_path, monkeypatch):
-    monkeypatch.setattr(KnowingSolver, "confidence", 0.3)
+def test_frames_that_are_not_tracked_have_no_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(KnowingSolver, "status", Status.UNCERTAIN)
     assert np.array_equal(recorded(tmp_path).texture, ball().texture)

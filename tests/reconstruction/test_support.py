@@ -6,11 +6,12 @@ import pytest
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
+from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.points.landmark_adjustment import LandmarkSupport
-from tracking3d.reconstruction.confidence import BELIEVED, judge_with_landmarks, refined_confidence_features
+from tracking3d.reconstruction.confidence import judge_with_landmarks, refined_confidence_features
 
-TRACKED = Assessment(Status.TRACKED, "", 0.9)
-DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)
+TRACKED = Assessment(Status.TRACKED, "", 0.95)
+DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.6)
 
 
 def test_the_more_of_the_landmarks_agree_the_more_an_answer_is_believed():
@@ -20,10 +21,10 @@ def test_the_more_of_the_landmarks_agree_the_more_an_answer_is_believed():
             for count in (150, 200, 250, 280)
         ]
         assert said == sorted(set(said))
-    barely = Assessment(Status.TRACKED, "", 0.52)
+    barely = Assessment(Status.TRACKED, "", 0.81)
     assert (
         judge_with_landmarks(barely, LandmarkSupport(300, 150)).confidence
-        < BELIEVED
+        < TRACKED_CONFIDENCE
         < judge_with_landmarks(barely, LandmarkSupport(300, 290)).confidence
     )
 
@@ -46,12 +47,12 @@ def test_a_frame_is_tracked_from_the_confidence_on_at_which_it_is_believed():
     for agreeing in range(0, 400, 10):
         for before in (TRACKED, DOUBTED):
             after = judge_with_landmarks(before, LandmarkSupport(400, agreeing))
-            assert (after.status is Status.TRACKED) is (after.confidence >= BELIEVED)
+            assert (after.status is Status.TRACKED) is (after.confidence >= TRACKED_CONFIDENCE)
             assert (after.reason == "") is (after.status is Status.TRACKED)
 
 
 def test_doubt_says_why():
-    barely = Assessment(Status.TRACKED, "", 0.52)
+    barely = Assessment(Status.TRACKED, "", 0.81)
     assert "(0 of 40 matched landmarks" in judge_with_landmarks(barely, LandmarkSupport(40, 0)).reason
     assert judge_with_landmarks(DOUBTED, LandmarkSupport(40, 0)).reason == DOUBTED.reason
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from tracking3d.estimation.estimate import FrameEstimate, Status
 
-SURE = 0.7
+SURE = 0.9
 """Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
 would teach it as many errors as it mends, and what it was taught wrongly comes back as evidence."""
 

@@ -72,6 +72,7 @@ def fit_confidence(
     right: ArrayLike,
     signs: Mapping[str, int] | None = None,
     penalty: float = PENALTY,
+    weights: ArrayLike | None = None,
 ) -> LogisticConfidence:
     """Fit the confidence that makes what was seen the likeliest, with small coefficients.
 
@@ -82,6 +83,7 @@ def fit_confidence(
             does;
             what is not named may do either.
         penalty: See `PENALTY`.
+        weights: ``(N,)``, how much each estimate counts; their mean is made 1. None: all the same.
 
     Raises:
         ValueError: If a shape does not fit, or all estimates are right or all wrong: then nothing can be learnt.
@@ -99,8 +101,9 @@ def fit_confidence(
     design = np.column_stack([np.ones(len(was_right)), *columns, *(~one for one in known)]).astype(float)
     free = (None, None)
     bounds = [_BOUNDS_OF_SIGN.get((signs or {}).get(name, 0), free) for name in names]
-    weights = _fit(design, was_right, penalty, [free, *bounds, *(free for _ in names)])
-    intercept, slopes, absent = weights[0], weights[1 : len(names) + 1], weights[len(names) + 1 :]
+    counts = np.ones(len(was_right)) if weights is None else floats("weights", weights, len(was_right))
+    found = _fit(design, was_right, counts / counts.mean(), penalty, [free, *bounds, *(free for _ in names)])
+    intercept, slopes, absent = found[0], found[1 : len(names) + 1], found[len(names) + 1 :]
     terms = []
     for name, (mean, spread, low, high), slope, gap in zip(names, scales, slopes, absent, strict=True):
         weight = slope / spread
@@ -147,6 +150,7 @@ def _standardize(
 def _fit(
     design: NDArray[np.float64],
     right: NDArray[np.bool_],
+    counts: NDArray[np.float64],
     penalty: float,
     bounds: Sequence[tuple[float | None, float | None]],
 ) -> NDArray[np.float64]:
@@ -156,8 +160,8 @@ def _fit(
 
     def loss(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         odds = design @ weights
-        value = np.logaddexp(0, odds).sum() - odds[right].sum() + 0.5 * held @ weights**2
-        return float(value), design.T @ (expit(odds) - right) + held * weights
+        value = counts @ (np.logaddexp(0, odds) - odds * right) + 0.5 * held @ weights**2
+        return float(value), design.T @ (counts * (expit(odds) - right)) + held * weights
 
     found = minimize(loss, np.zeros(design.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds)
     return np.asarray(found.x, dtype=np.float64)

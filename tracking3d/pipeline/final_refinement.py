@@ -22,7 +22,7 @@ from tracking3d.pipeline.refinement_steps import (
     estimate_again,
 )
 from tracking3d.pipeline.saved_masks import SavedMasks
-from tracking3d.reconstruction import BELIEVED, TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction import TextureView, keep_best_views, texture_view
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.reconstruction.held_adjustment import HeldAdjustment
 from tracking3d.rendering.backend import share_threads
@@ -120,7 +120,7 @@ class FinalRefinement:
         most = self._session.config.object.texture_views
         if self._precomputed is None:
             self._last.collect(frame, mask)
-        if most and record.status is Status.TRACKED and record.confidence >= BELIEVED:
+        if most and record.status is Status.TRACKED:
             camera = record.through(self._session.camera)
             image, seen = camera.undistort(frame.image), camera.mask_to_pinhole(mask)
             view = texture_view(frame.index, image, seen, camera, record.T_cam_obj)

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.gap import Gap
-from tracking3d.frames import Frame
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.pipeline.frame_reading import read_again, read_timed
 from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
-from tracking3d.reconstruction import BELIEVED
 from tracking3d.runtime.progress import report_each
 from tracking3d.video.both_ways import backwards
 from tracking3d.video.source import FrameSource
@@ -71,7 +70,7 @@ class GapTracker:
         return {
             index
             for index in self._frames_taken
-            if self.confidence.get(index, 0.0) < BELIEVED and self._masks.has_mask(index)
+            if self.confidence.get(index, 0.0) < TRACKED_CONFIDENCE and self._masks.has_mask(index)
         }
 
     def _sweep(self, *, backwards: bool) -> None:
@@ -92,7 +91,7 @@ class GapTracker:
                 self.confidence[estimate.index] = estimate.confidence
                 if estimate.status is not Status.LOST:
                     self._poses[estimate.index] = np.asarray(estimate.T_cam_obj, np.float64)
-            if estimate.keyframe and estimate.confidence >= BELIEVED:
+            if estimate.keyframe and estimate.confidence >= TRACKED_CONFIDENCE:
                 self._anchors.add(estimate.index)
 
     def _frames(self, reverse: bool) -> Generator[Frame]:

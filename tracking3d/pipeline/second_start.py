@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.initialization.start_window import score_starts
-from tracking3d.frames import Frame
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.pipeline.frame_reading import read_again, read_timed
 from tracking3d.pipeline.gap_tracker import GapTracker
 from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
-from tracking3d.reconstruction import BELIEVED
 from tracking3d.runtime.progress import report_each
 from tracking3d.video.both_ways import both_ways
 from tracking3d.video.source import FrameSource
@@ -78,8 +77,8 @@ def try_second_start(
         )
     if attempt is None:
         return None
-    before = sum(known >= BELIEVED for known in gaps.confidence.values())
-    second = SecondStart(start, sum(one >= BELIEVED for one in attempt.confidence.values()), before)
+    before = sum(known >= TRACKED_CONFIDENCE for known in gaps.confidence.values())
+    second = SecondStart(start, sum(one >= TRACKED_CONFIDENCE for one in attempt.confidence.values()), before)
     if second.is_better:
         session.adopt(attempt)
     return second

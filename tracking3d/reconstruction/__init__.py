@@ -1,6 +1,6 @@
 """What is made of a tracked object once its poses are known: a texture at the resolution of the video."""
 
 from tracking3d.reconstruction.texturing import bake_texture
-from tracking3d.reconstruction.views import BELIEVED, TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
 
-__all__ = ["BELIEVED", "TextureView", "bake_texture", "keep_best_views", "texture_view"]
+__all__ = ["TextureView", "bake_texture", "keep_best_views", "texture_view"]

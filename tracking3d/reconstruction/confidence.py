@@ -10,18 +10,20 @@ import math
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
+from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.results.records import FrameRecord
 
-BELIEVED = 0.5
-"""Confidence from which a frame is `tracked`."""
 _EVEN, _NEARLY_ALL = 0.5, 0.95
 """Shares of the followed landmarks that agree, between which belief grows: if poses are wrong, what is followed is
 often something else, such as the background, and much of it fits no pose."""
-_INTERCEPT = -0.8803
+_ENOUGH = 30
+"""Landmark inliers from which on more of them add nothing."""
+_INTERCEPT = -1.48
 _TERMS = {  # weight, and the range that was seen
-    "rendering": (1.012, -3.861, 2.624),
-    "share": (0.8517, 0.0, math.log(_NEARLY_ALL / (1 - _NEARLY_ALL))),
+    "rendering": (1.01, -1.62, 4.11),
+    "share": (0.366, 0.0, math.log(_NEARLY_ALL / (1 - _NEARLY_ALL))),
+    "landmarks": (0.191, 0.0, math.log1p(_ENOUGH)),
 }
 
 
@@ -41,9 +43,8 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
     A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
-    ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
-    and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree adds
-    nothing to the share that does. A plain object has no landmarks, and keeps the confidence of its rendering.
+    ``training/confidence.py --refined`` on synthetic suites and real clips; docs/method/confidence.md has which, and
+    what it is worth on others. A plain object has no landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -54,7 +55,7 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     evidence = refined_confidence_features(rendering.confidence, support)
     odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
     confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
-    if confidence >= BELIEVED:
+    if confidence >= TRACKED_CONFIDENCE:
         return Assessment(Status.TRACKED, "", confidence)
     reason = rendering.reason
     if rendering.status is Status.TRACKED or not reason:
@@ -71,8 +72,9 @@ def refined_confidence_features(rendering: float, support: LandmarkSupport) -> d
     """
     share = (1 + support.agreeing) / (2 + support.followed)
     return {
-        "rendering": _log_odds(min(max(rendering, 0.02), 0.98)),
+        "rendering": _log_odds(min(max(rendering, 0.01), 0.99)),
         "share": _log_odds(min(max(share, _EVEN), _NEARLY_ALL)),
+        "landmarks": math.log1p(support.agreeing),
     }
 
 

@@ -9,7 +9,6 @@ from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame, pixels
-from tracking3d.reconstruction.views import BELIEVED
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each
@@ -51,12 +50,10 @@ def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterato
             raise InputError(
                 f"{name} does not begin as the video of the run {run.folder} did; give that by --source."
             )
-        if record.status is Status.TRACKED and record.confidence >= BELIEVED:
+        if record.status is Status.TRACKED:
             yield replace(frame, image=run.camera_of(record).undistort(frame.image)), record
 
 
 def no_reliable_frame_error(run: RunReader) -> InputError:
     """The message if there is no such frame."""
-    return InputError(
-        f"No frame of the run {run.folder} is tracked with a confidence of {BELIEVED} or more; its mesh stays as it is."
-    )
+    return InputError(f"No frame of the run {run.folder} is tracked; its mesh stays as it is.")

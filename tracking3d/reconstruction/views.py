@@ -12,8 +12,6 @@ from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 
-BELIEVED = 0.5
-"""Confidence of a pose from which on a texture is taken from its frame."""
 _MARGIN = 0.05  # around the mask, relative to its longer side
 _LARGEST = 640  # pixels of a view's side; a larger window is seen smaller
 _OUTLINE = (1.5, 4.5)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.segmentation.colour_models import ColourModels, beside_outline, relative_distance
+from tracking3d.segmentation.pose_weight import relative_confidence
 
 SOURCES = {
     "initial, near": 0.001,
@@ -55,7 +56,7 @@ def pixel_features(
     for mask in (initial, rendered):
         distance = relative_distance(mask)
         shapes += [np.clip(distance / _NEAR, -_MOST, _MOST), np.tanh(distance / _AT_OUTLINE)]
-    shapes += [confidence * one for one in shapes]
+    shapes += [relative_confidence(confidence) * one for one in shapes]
     # Colours are those on either side of where the shapes put the outline.
     likely = np.tensordot(_BY_SHAPE, np.stack(shapes), 1) > 0
     nearby = beside_outline(lab, likely) if likely.any() else np.zeros(likely.shape, np.float32)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_NO_WEIGHT, _FULL_WEIGHT = 0.2, 0.4
+from tracking3d.frames import TRACKED_CONFIDENCE
+
+_NO_WEIGHT, _FULL_WEIGHT = 0.5, 0.75
 """Confidence of a pose up to which it redraws nothing, and from which it has its say in full."""
 _INITIAL_LOG_ODDS = 2.0
 """Log-odds of the pixels of an initial mask, and less those beside it, where it is weighed against a doubted pose."""
@@ -18,6 +20,18 @@ def pose_weight(confidence: float) -> float:
         confidence: The confidence of the pose, in [0, 1].
     """
     return min(max((confidence - _NO_WEIGHT) / (_FULL_WEIGHT - _NO_WEIGHT), 0.0), 1.0)
+
+
+def relative_confidence(confidence: float) -> float:
+    """The confidence on the scale of the mask weights, which is one half where a frame just counts as tracked.
+
+    The weights of the mask evidence were fitted with confidences of this scale.
+
+    Args:
+        confidence: The confidence of the pose, in [0, 1].
+    """
+    odds = confidence * (1 - TRACKED_CONFIDENCE)
+    return odds / (odds + (1 - confidence) * TRACKED_CONFIDENCE)
 
 
 def blend_with_initial(

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
@@ -31,7 +32,6 @@ from tracking3d.segmentation.whole_video_weights import WEIGHTS
 
 MOST_VIEWS = 60
 """The most frames that are combined, spread over the reliable ones."""
-_BELIEVED = 0.5
 _ASKED = 0.4
 """How far the image smooths what is said, see `snap_to_edges`: in an even one outlines would creep."""
 _AT_A_TIME = 2
@@ -82,7 +82,9 @@ class VideoSegmenter:
     ) -> None:
         self._camera, self._vertices, self._faces = camera, vertices, faces
         self._due = due
-        chosen = sorted(index for index, confidence in confidences.items() if confidence >= _BELIEVED)
+        chosen = sorted(
+            index for index, confidence in confidences.items() if confidence >= TRACKED_CONFIDENCE
+        )
         chosen = chosen or sorted(confidences)
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}

@@ -11,7 +11,6 @@ from rendered_solids import pose_of
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.confidence import (
-    BELIEVED,
     ENOUGH_POINTS,
     SETTLED,
     LossBaseline,
@@ -22,6 +21,7 @@ from tracking3d.estimation.online.state.confidence import (
     loss_excess,
     needs_relocalization,
 )
+from tracking3d.frames import TRACKED_CONFIDENCE
 
 MANY, FEW = ENOUGH_POINTS, ENOUGH_POINTS - 1
 USUAL = LossBaseline(appearance=0.2, outline=0.3, overlap=0.9)
@@ -110,16 +110,16 @@ def test_with_points_only_a_large_excess_or_points_off_place_do():
 def test_confidence_rises_with_the_points_that_agree_and_status_goes_with_it():
     verdicts = [assess_pose(fit(), USUAL, PoseEvidence(points)) for points in (0, MANY, 60, 400)]
     said = [one.confidence for one in verdicts]
-    assert said == sorted(said) and said[0] < BELIEVED < 0.7 < said[-1]
+    assert said == sorted(said) and said[0] < TRACKED_CONFIDENCE < 0.9 < said[-1]
     for verdict in verdicts:
-        tracked = verdict.confidence >= BELIEVED
+        tracked = verdict.confidence >= TRACKED_CONFIDENCE
         assert verdict.status is (Status.TRACKED if tracked else Status.UNCERTAIN)
         assert bool(verdict.reason) == (not tracked)
     assert "few inliers" in verdicts[0].reason
 
 
-def test_without_a_mask_confidence_is_even_at_most():
-    assert assess_pose(fit(), USUAL, PoseEvidence(MANY, has_mask=False)).confidence <= 0.5
+def test_without_a_mask_a_frame_is_just_tracked_at_most():
+    assert assess_pose(fit(), USUAL, PoseEvidence(MANY, has_mask=False)).confidence <= TRACKED_CONFIDENCE
 
 
 def test_the_reason_names_what_speaks_most_against_the_pose():
@@ -167,7 +167,7 @@ def test_a_plain_object_whose_outline_fits_is_not_lost_though_its_shades_change(
     plain = PoseEvidence(0, untextured=True)
     verdict = assess_pose(WRONG, USUAL, plain)
     assert verdict.status is Status.UNCERTAIN and "outline fits" in verdict.reason
-    assert verdict.confidence <= 0.2
+    assert verdict.confidence <= 0.5
     assert assess_pose(fit(appearance=0.7, overlap=0.8), USUAL, plain).status is Status.LOST
     assert assess_pose(fit(appearance=0.7, outline=0.5), USUAL, plain).status is Status.LOST
     assert assess_pose(WRONG, USUAL, replace(plain, has_mask=False)).status is Status.LOST

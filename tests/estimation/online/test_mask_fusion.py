@@ -148,7 +148,7 @@ def test_a_pose_redraws_the_more_the_higher_its_confidence_is():
     initial = disc(SIZE, (113, 80), 50)
     changed = [
         int((answer(TRUTH, TRUTH, initial, confidence=confidence)[0] != initial).sum())
-        for confidence in (0.2, 0.24, 0.28, 0.4)
+        for confidence in (0.5, 0.54, 0.6, 0.75)
     ]
     assert changed[0] == 0 < changed[2] < changed[3]
     assert changed == sorted(changed)

@@ -25,9 +25,10 @@ from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.frame_mapping import FrameMapping
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.mapping.keyframe_culling import prune_landmarks
-from tracking3d.estimation.online.state.confidence import BELIEVED, ENOUGH_POINTS
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.frames import TRACKED_CONFIDENCE
 
 _ROOM = 1.5
 """Factor by which an extended map may have more keyframes."""
@@ -56,7 +57,7 @@ class MapExtension(FrameMapping):
         if object_map.pointless or object_map.fixed_keyframes:
             return None
         own = {index: confidence[index] for index in frames_of_map(state, confidence)}
-        explained = frozenset(index for index, known in own.items() if known >= BELIEVED)
+        explained = frozenset(index for index, known in own.items() if known >= TRACKED_CONFIDENCE)
         object_map = _remove_unsupported(object_map, explained)
         object_map, camera = refine_globally(object_map, state.camera, self.online)
         anchors = explained.intersection(view.index for view in object_map.keyframes)

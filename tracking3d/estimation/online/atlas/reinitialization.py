@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
-from tracking3d.estimation.online.state.confidence import BELIEVED
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
-from tracking3d.frames import Frame
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.segmentation import as_lab
 
 _LASTING_DOUBT = 20  # doubtful frames in a row from which a map without points is doubted itself
@@ -63,4 +62,4 @@ def colours_match(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> 
 
 def is_reliable(begun: SolverState, estimate: FrameEstimate) -> bool:
     """Whether a second initialization is reliable enough to continue with."""
-    return not begun.object_map.pointless and estimate.confidence >= BELIEVED
+    return not begun.object_map.pointless and estimate.confidence >= TRACKED_CONFIDENCE

@@ -10,13 +10,14 @@ from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.optimization.observability import least_constrained_axis
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
+from tracking3d.frames import TRACKED_CONFIDENCE
 
 ENOUGH_POINTS = 15
 """Inliers that settle a pose, whatever the appearance says."""
 _UNSEEN_CHARGE = PoseWeights().unseen
 _FULL_WEIGHT_TEXTURE = 0.8  # share of known texture from which the appearance counts in full
 _MOSTLY_UNSEEN = 0.7  # share of unseen texture
-_INTERCEPT = -0.429
+_INTERCEPT = 0.957
 _TERMS = {  # weight, and the range that was seen
     "missed": (-6.219, 0.0, 0.5394),
     "unseen_ratio": (-3.339, 0.00157, 0.5698),
@@ -33,16 +34,15 @@ _REASONS = {
     "points": "the reprojection errors of the inliers are too large (loss {fit.points:.2f})",
     "min_curvature": "rotation about camera axis ({axis}) is poorly constrained",
 }
-_POINTS_ONLY = 0.4  # highest confidence if the points fit and the appearance does not
-_OUTLINE_ONLY = 0.2  # highest confidence if only the outline fits
+_POINTS_ONLY = 0.73  # highest confidence if the points fit and the appearance does not
+_OUTLINE_ONLY = 0.5  # highest confidence if only the outline fits
 _USUAL_OVERLAP = 0.97  # share of the usual overlap
-_WITHOUT_MASK = 0.5  # highest confidence if there is no mask to compare with
+_WITHOUT_MASK = TRACKED_CONFIDENCE  # highest confidence if there is no mask to compare with
+_UNSEEN_ODDS = 1 / 3  # factor of the odds of a pose that few points and hardly any known texture confirm
 _MEMORY = 0.9  # of the running means
 SETTLED = 15
 """Tracked frames whose means bound those of later ones."""
 _WORST_RATIO, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may move from there
-BELIEVED = 0.5
-"""Confidence from which a frame is `tracked`; below it, the frame is relocalized too."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 
     Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
-    of the suite ``fresh`` of seed 9101; docs/method/confidence.md has its calibration on other seeds.
+    of the suite ``fresh`` of seed 9101, and its intercept to further suites and real clips; docs/method/confidence.md
+    has its calibration on others.
     """
     return 1 / (1 + math.exp(-_INTERCEPT - sum(_log_odds(fit, evidence).values())))
 
@@ -219,8 +220,8 @@ def assess_pose(
     if not evidence.has_mask:
         confidence = min(confidence, _WITHOUT_MASK)
     if few and fit.unseen > _MOSTLY_UNSEEN:
-        confidence *= 0.5
-    if astray and few and confidence < BELIEVED:
+        confidence = _scale_odds(confidence, _UNSEEN_ODDS)
+    if astray and few and confidence < TRACKED_CONFIDENCE:
         status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
             status, "after the loss, what was found may be another object", min(confidence, _OUTLINE_ONLY)
@@ -228,9 +229,14 @@ def assess_pose(
     if far:
         reason = f"the points fit, the appearance does not (loss {fit.appearance:.2f})"
         return Assessment(Status.UNCERTAIN, reason, min(confidence, _POINTS_ONLY))
-    if confidence >= BELIEVED:
+    if confidence >= TRACKED_CONFIDENCE:
         return Assessment(Status.TRACKED, "", confidence)
     return Assessment(Status.UNCERTAIN, _doubt(fit, evidence), confidence)
+
+
+def _scale_odds(probability: float, factor: float) -> float:
+    """The probability whose odds are ``factor`` times those of ``probability``."""
+    return probability * factor / (1 - probability + probability * factor)
 
 
 def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:

@@ -8,8 +8,9 @@ from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.optimization.types import PoseFit
-from tracking3d.estimation.online.state.confidence import BELIEVED, PoseEvidence
+from tracking3d.estimation.online.state.confidence import PoseEvidence
 from tracking3d.estimation.online.state.object_map import Keyframe
+from tracking3d.frames import TRACKED_CONFIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class PoseCandidate:
     @property
     def doubtful(self) -> bool:
         """Whether the object is lost or the confidence is low."""
-        return self.assessment.confidence < BELIEVED
+        return self.assessment.confidence < TRACKED_CONFIDENCE
 
     def better_than(self, other: PoseCandidate) -> bool:
         """Whether it has more inliers and a lower rendering cost; any pose is better than none."""
