@@ -3,6 +3,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -146,3 +148,21 @@ def test_files_and_pictures_hold_what_is_known(shaken, scene, tmp_path):
     write_trails(tmp_path / "trails.mp4", clip.frames, tracks, 25.0)
     frames = list(open_source(tmp_path / "trails.mp4"))
     assert len(frames) == 8
+
+
+def test_estimates_that_landmarks_adjusted_are_taken_as_they_are(shaken, tmp_path):
+    folder, clip, _ = shaken
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / layout.LANDMARKS).unlink(missing_ok=True)
+    lines = [json.loads(line) for line in (run / layout.FRAMES).read_text().splitlines()]
+    for line in lines:
+        line["refined"] = True
+        line["diagnostics"] = {**line["diagnostics"], "landmark_matches": 40.0, "landmark_inliers": 38.0}
+    (run / layout.FRAMES).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    heard = []
+    with listen_to_progress(heard.append):
+        taken = open_scene(run, source(clip))
+    assert {progress.name for progress in heard} == {"reading frames"}
+    for view, record in zip(taken.scene.views, RunReader(run).frames, strict=True):
+        assert np.allclose(view.T_cam_obj, record.T_cam_obj)
