@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from layers import Motion, alpha_of, paste, placed, shadow_of, smeared, warp
-from occluders import cut_sign, draw_gripper, draw_hand
+from occluders import cut_sign, draw_gripper, draw_hand, with_arm
 from photometry import Camera, light_over
 from scenes import CANVAS, OBJECT, Frame, Scene, background_frames
 
@@ -156,8 +156,10 @@ def _holder(
     """A hand or gripper from beyond the border: what of it is behind the object, if any, and what is in front."""
     if kind == "gripper":
         layer = draw_gripper(rng)
-    elif material.hands and rng.random() < 0.65:
+    elif material.hands and rng.random() < 0.85:
         layer = _pick(material.hands, rng)
+        if rng.random() < 0.8:
+            layer = with_arm(layer, _pick(material.photographs, rng), rng)
     else:
         layer = draw_hand(rng)
     turn = rng.uniform(0, 360)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,9 @@ from make_masks import LOGIT_SCALE
 Image = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 
+_MIXED = 0.15
+"""A mask that shares more with the hands is not one thing."""
+
 
 @dataclass(frozen=True, eq=False)
 class Masked:
@@ -24,12 +27,14 @@ class Masked:
         soft: ``(H, W)`` float32 in [0, 1], the teacher's probability.
         box: ``(x, y, w, h)`` of the mask.
         quality: The IoU that the teacher expects.
+        hands: ``(H, W)`` likewise, of all hands in the photograph; None if none was found.
     """
 
     image: Image
     soft: NDArray[np.float32]
     box: Box
     quality: float
+    hands: NDArray[np.float32] | None = None
 
 
 def read_masked(photos: Path, file: Path) -> list[Masked]:
@@ -47,6 +52,19 @@ def read_masked(photos: Path, file: Path) -> list[Masked]:
         soft = 1 / (1 + np.exp(-1.5 * values[: image.shape[0], : image.shape[1]]))
         found.append(Masked(image, soft.astype(np.float32), tuple(map(float, box)), float(value)))
     return found
+
+
+def with_hands(items: list[Masked], hands: list[Masked]) -> list[Masked]:
+    """The things of one photograph that are no hands, nor partly hands, each with the hands beside it."""
+    if not hands:
+        return items
+    together = np.max([hand.soft for hand in hands], axis=0)
+    kept = []
+    for item in items:
+        common = np.minimum(item.soft, together).sum()
+        if common < _MIXED * item.soft.sum() and common < _MIXED * together.sum():
+            kept.append(replace(item, hands=together))
+    return kept
 
 
 def touched_sides(item: Masked) -> int:

@@ -34,6 +34,42 @@ def draw_hand(rng: np.random.Generator) -> Image:
     return _coloured(shape, depth, np.array(_SKIN[int(rng.integers(len(_SKIN)))], float), rng)
 
 
+def with_arm(hand: Image, photograph: Image, rng: np.random.Generator) -> Image:
+    """A cut-out of a hand ``(h, w, 4)``, its fingers up, with a bare arm or a sleeve below, of about its height."""
+    height, width = hand.shape[:2]
+    rows = slice(int(0.93 * height), height)
+    columns = np.flatnonzero((hand[rows, :, 3] > 127).any(0))
+    if not len(columns):
+        return hand
+    tall, left, right = int(rng.uniform(1.5, 2.4) * height), columns[0], columns[-1]
+    canvas = np.zeros((tall, width, 4), np.uint8)
+    lean = rng.normal(0, 0.15) * height
+    corners = [
+        (left, int(0.95 * height)),
+        (right, int(0.95 * height)),
+        (right + lean, tall),
+        (left + lean, tall),
+    ]
+    alpha = np.zeros((tall, width), np.uint8)
+    cv2.fillPoly(alpha, [np.array(corners, np.int32)], 255)
+    canvas[..., 3] = alpha
+    skin = hand[hand[..., 3] > 200][:, :3]
+    colour = np.median(skin, axis=0) if len(skin) else np.full(3, 128.0)
+    across = np.linspace(-1, 1, width)[None, :, None]
+    arm = np.broadcast_to(colour * (1 - 0.25 * across**2), (tall, width, 3)).copy()
+    if rng.random() < 0.6:  # a sleeve
+        cuff = int(rng.uniform(0.9, 1.4) * height)
+        cloth = cv2.resize(photograph, (width, max(tall - cuff, 1))).astype(float)
+        tint = rng.uniform(0, 255, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(10, 240))
+        arm[cuff:] = (0.3 * cloth + 0.7 * tint)[: tall - cuff] * (1 - 0.3 * across**2)
+    canvas[..., :3] = np.clip(arm + rng.normal(0, 2, arm.shape), 0, 255).astype(np.uint8)
+    share = hand[..., 3:].astype(float) / 255
+    over = canvas[:height].astype(float)
+    canvas[:height, :, :3] = (share * hand[..., :3] + (1 - share) * over[..., :3]).astype(np.uint8)
+    canvas[:height, :, 3:] = np.maximum(canvas[:height, :, 3:], hand[..., 3:])
+    return canvas
+
+
 def draw_gripper(rng: np.random.Generator) -> Image:
     """``(200, 200, 4)`` RGBA: a wrist from below and two jaws, of metal or plastic."""
     shape = np.zeros((4 * _SIDE, 4 * _SIDE), np.uint8)

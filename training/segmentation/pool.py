@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from composed import Material, composed_scene
-from cutouts import Masked, cut_out, read_masked, touched_sides
+from cutouts import Masked, cut_out, read_masked, touched_sides, with_hands
 from recipe import Recipe, read_recipe
 from scenes import CANVAS, PLANES, sample_of, still_scene
 from split import held_out
@@ -26,8 +26,8 @@ CUTOUT = 150
 _READ = 160
 """Photographs with masks that are read for one file of the pool: a random part, for the memory's sake."""
 
-_FIRST, _EACH, _ALL, _PAUSE = 100, 20, 0.9, 30
-_BEST = 0.9
+_FIRST, _EACH, _ALL, _PAUSE = 100, 10, 0.9, 30
+_BEST, _BEST_TOUCHING = 0.9, 0.96
 _MIN_VISIBLE = 0.3
 _SHARE_OF_ONE_SOURCE = 0.45
 
@@ -86,9 +86,13 @@ def _materials(recipe: Recipe, validation: bool, rng: np.random.Generator) -> tu
     files = [file for file in sorted(recipe.masks.glob("*/*.npz")) if not file.name.endswith(".part.npz")]
     files = [file for file in files if (f"{file.parent.name}/{file.stem}.jpg" in kept) == validation]
     chosen = _mixed(files, rng)
-    items = [item for file in chosen for item in read_masked(recipe.photos, file)]
+    items = [item for file in chosen for item in _items(recipe, file)]
     # What reaches from one side of the picture to the other is rarely an object that someone would box.
-    stills = [item for item in items if touched_sides(item) < 2]
+    stills = [
+        item
+        for item in items
+        if touched_sides(item) == 0 or (touched_sides(item) == 1 and item.quality > _BEST_TOUCHING)
+    ]
     objects = [cut_out(item, CUTOUT) for item in items if touched_sides(item) == 0 and item.quality > _BEST]
     photographs = [
         cv2.imread(str(recipe.photos / f"{f.parent.name}/{f.stem}.jpg")) for f in _mixed(files, rng)[:60]
@@ -100,6 +104,14 @@ def _materials(recipe: Recipe, validation: bool, rng: np.random.Generator) -> tu
     photographs = [cv2.cvtColor(image, cv2.COLOR_BGR2RGB) for image in photographs]
     hands = _hands(recipe, validation, rng)
     return stills, Material(photographs, objects, hands)
+
+
+def _items(recipe: Recipe, file: Path) -> list[Masked]:
+    items = read_masked(recipe.photos, file)
+    if recipe.hand_masks is None:
+        return items
+    hands = recipe.hand_masks / file.parent.name / file.name
+    return with_hands(items, read_masked(recipe.photos, hands) if hands.exists() else [])
 
 
 def _mixed(files: Sequence[Path], rng: np.random.Generator) -> list[Path]:

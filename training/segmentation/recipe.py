@@ -16,6 +16,9 @@ class Recipe(BaseModel):
     photos: Path = Field(description="Folder that collect.py filled.")
     masks: Path = Field(description="Folder that make_masks.py filled.")
     hands: Path | None = Field(None, description="Folder with cut-outs of real hands, RGBA PNG.")
+    hand_masks: Path | None = Field(
+        None, description="Folder with the masks of hands that make_hands.py filled."
+    )
     pool: Path = Field(description="Folder of the prepared samples.")
     seed: int = 0
     threads: int = Field(1, ge=1, description="CPU threads of torch.")

@@ -100,8 +100,11 @@ def still_scene(item: Masked, rng: np.random.Generator) -> Scene:
         image = _resampled(item.image, matrix)
         mask = np.clip(_resampled(item.soft, matrix, cv2.BORDER_CONSTANT), 0, 1)
         picture = camera.take(image.astype(np.float32), rng)
-        frames.append(Frame(picture, mask, np.zeros_like(mask), []))
-    return Scene(*frames, kind="still", knows_occluder=False)
+        hands = np.zeros_like(mask)
+        if item.hands is not None:
+            hands = np.clip(_resampled(item.hands, matrix, cv2.BORDER_CONSTANT), 0, 1)
+        frames.append(Frame(picture, mask, hands, [] if item.hands is None else [hands]))
+    return Scene(*frames, kind="still", knows_occluder=item.hands is not None)
 
 
 def _resampled(image: NDArray, matrix: NDArray[np.float64], border: int = cv2.BORDER_REPLICATE) -> NDArray:
