@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from split import held_out
 from teacher import GRID, SIDE, Answer, Teacher, mask_iou
 
 LOGIT_SCALE = 8
@@ -32,9 +33,12 @@ _MOST = 10
 _DEPTH = 3
 """So many folders of a photograph's path tell one kind from another."""
 
+_FIRST_HELD_OUT = 130
+"""So many photographs that are kept for validation come first."""
+
 
 def main(photos: Path, models: Path, out: Path, threads: int, part: int, parts: int) -> None:
-    """Go over the photographs, one of every folder of every source in turn."""
+    """Go over the photographs, first some of those held out, then one of every folder of every source in turn."""
     order = _in_turn(photos)
     teacher = Teacher(models, threads)
     start, done, found = time.monotonic(), 0, 0
@@ -64,7 +68,10 @@ def _in_turn(photos: Path) -> list[Path]:
                 folders.setdefault((source, *inside), []).append(photos / row["file"])
     for files in folders.values():
         np.random.default_rng(0).shuffle(files)
-    return [file for files in zip_longest(*folders.values()) for file in files if file is not None]
+    order = [file for files in zip_longest(*folders.values()) for file in files if file is not None]
+    kept = held_out(photos)
+    apart = [file for file in order if f"{file.parent.name}/{file.name}" in kept]
+    return apart[:_FIRST_HELD_OUT] + order
 
 
 def find_objects(teacher: Teacher, shape: tuple[int, int], rng: np.random.Generator) -> list[Answer]:
