@@ -93,6 +93,7 @@ class StandInSolver(CausalSolver):
             mask=estimate.initial_mask,
             status=Status.TRACKED,
             reason="",
+            confidence=0.9,
             keyframe=False,
         )
 

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
@@ -30,6 +29,8 @@ from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbour
 from tracking3d.segmentation.whole_video_features import PixelEvidence
 from tracking3d.segmentation.whole_video_weights import WEIGHTS
 
+_LEAST_CONFIDENCE = 0.5
+"""Of the frames that are combined; all if none has it."""
 MOST_VIEWS = 60
 """The most frames that are combined, spread over the reliable ones."""
 _ASKED = 0.4
@@ -82,9 +83,7 @@ class VideoSegmenter:
     ) -> None:
         self._camera, self._vertices, self._faces = camera, vertices, faces
         self._due = due
-        chosen = sorted(
-            index for index, confidence in confidences.items() if confidence >= TRACKED_CONFIDENCE
-        )
+        chosen = sorted(index for index, confidence in confidences.items() if confidence >= _LEAST_CONFIDENCE)
         chosen = chosen or sorted(confidences)
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
         self._wanted = {chosen[place] for place in places}

@@ -22,7 +22,6 @@ from tracking3d.segmentation.colour_models import (
 )
 from tracking3d.segmentation.edge_alignment import alignment, edge_strength
 from tracking3d.segmentation.frame_window import FrameWindow
-from tracking3d.segmentation.pose_weight import relative_confidence
 from tracking3d.trackers.outline import inside_distance
 
 Plane = NDArray[np.float32]
@@ -102,8 +101,7 @@ class PixelEvidence:
 
     def _terms(self) -> Iterator[tuple[Plane, dict[str, np.float32 | Plane]]]:
         """What is said, ``(S, S)``, and by source how far it is trusted: throughout, or ``(S, S)`` of each pixel."""
-        one, doubt = np.float32(1), np.float32(self._doubt())
-        confidence = np.float32(relative_confidence(self.confidence))
+        one, confidence, doubt = np.float32(1), np.float32(self.confidence), np.float32(self._doubt())
         for name, distance in self.distances.items():
             around, whole = self.alignments[name]
             beliefs: dict[str, np.float32 | Plane] = {
