@@ -91,7 +91,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                     "recorded_odds": _log_odds(record.confidence),
                     **_of_landmarks(record),
                 }
-                yield Judged(truth.name, benchmark.name, evidence, right[record.index])
+                yield Judged(truth.name, benchmark.resolve().name, evidence, right[record.index])
 
 
 def _log_odds(probability: float) -> float:
@@ -129,9 +129,14 @@ def balanced(frames: list[Judged]) -> np.ndarray:
     return np.array([1 / math.sqrt(sizes[one.group]) for one in frames])
 
 
-def test_groups(frames: list[Judged], names: list[str], signs: dict[str, int], penalty: float) -> None:
-    """Print for every group what a fit on the others is worth there."""
-    for group in sorted({one.group for one in frames}):
+def fit_groups(
+    frames: list[Judged], names: list[str], signs: dict[str, int], penalty: float
+) -> LogisticConfidence:
+    """The fit on all groups; for every group it is printed what a fit on the others is worth there."""
+    groups = sorted({one.group for one in frames})
+    if len(groups) < 2:
+        raise InputError("At least two folders with finished runs are needed for --balance; give more.")
+    for group in groups:
         others = [one for one in frames if one.group != group]
         fit = fit_confidence(*table(others, names), signs, penalty, balanced(others))
         evidence, right = table([one for one in frames if one.group == group], names)
@@ -142,6 +147,7 @@ def test_groups(frames: list[Judged], names: list[str], signs: dict[str, int], p
     everything = fit_confidence(*table(frames, names), signs, penalty, balanced(frames))
     print("\n# fitted on all groups:")
     print(as_python_source(everything))
+    return everything
 
 
 def tested(said: np.ndarray, right: np.ndarray) -> str:
@@ -164,7 +170,9 @@ def main(words: list[str]) -> None:
     frames = [one for one in frames if any(name in one.evidence for name in names)]
     signs = {name.lstrip("+-"): 1 if name[0] == "+" else -1 for name in asked if name[:1] in ("+", "-")}
     if options.balance:
-        test_groups(frames, names, signs, options.penalty)
+        found = fit_groups(frames, names, signs, options.penalty)
+        if options.json:
+            options.json.write_text(json.dumps({"all": asdict(found)}, indent=1))
         return
     first, second = halves([one.sequence for one in frames])
     if not second:

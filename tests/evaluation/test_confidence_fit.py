@@ -112,3 +112,15 @@ def test_the_halves_share_no_sequence_and_do_not_depend_on_order():
 def test_the_area_under_the_curve_of_ranks():
     right = np.array([True, True, False, False])
     assert area_under_roc([0.9, 0.3, 0.3, 0.1], right) == pytest.approx(3.5 / 4)
+
+
+def test_an_estimate_with_twice_the_weight_counts_as_two():
+    silhouette = np.array([0.0] * 6 + [1.0] * 6)
+    right = np.array([True] * 4 + [False] * 2 + [True, False, False, False, False, False])
+    weights = np.where(right, 2.0, 1.0)
+    twice = np.repeat(np.arange(12), weights.astype(int))
+    weighed = fit_confidence({"silhouette": silhouette}, right, penalty=1e-9, weights=weights)
+    repeated = fit_confidence({"silhouette": silhouette[twice]}, right[twice], penalty=1e-9)
+    ends = {"silhouette": np.array([0.0, 1.0])}
+    assert weighed(ends) == pytest.approx([8 / 10, 2 / 7], abs=1e-3)
+    assert weighed(ends) == pytest.approx(repeated(ends), abs=1e-3)

@@ -36,6 +36,11 @@ def test_few_that_agree_say_less_than_many():
     )
 
 
+def test_beyond_thirty_more_of_them_add_nothing():
+    said = [judge_with_landmarks(TRACKED, LandmarkSupport(count, count)).confidence for count in (200, 400)]
+    assert said[0] == said[1]
+
+
 def test_what_was_believed_before_counts_too():
     support = LandmarkSupport(200, 120)
     assert (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -113,3 +114,23 @@ def _errors(told):
 def test_one_sequence_is_not_enough(script, benchmark):
     with pytest.raises(InputError, match="At least two sequences"):
         script.main([str(benchmark), "--solver", "paper"])
+
+
+def test_with_balance_every_folder_is_tested_by_a_fit_on_the_others(script, benchmark, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(benchmark, other)
+    file = tmp_path / "coefficients.json"
+    script.main(
+        [str(benchmark), str(other), "--balance", "--evidence=-silhouette,recorded_odds", "--json", str(file)]
+    )
+    told = capsys.readouterr().out
+    assert [line.split(":")[0] for line in told.splitlines() if "frames" in line] == ["other", "out"]
+    terms = {one["name"]: one for one in json.loads(file.read_text())["all"]["terms"]}
+    assert terms["silhouette"]["weight"] < -2 and terms["recorded_odds"]["weight"] == 0  # it never differs
+    with pytest.raises(InputError, match="At least two folders"):
+        script.main([str(benchmark), "--balance", "--evidence=silhouette"])
+
+
+def test_a_frame_of_a_large_group_counts_less(script):
+    frames = [script.Judged("s", group, {}, True) for group in "aaaab"]
+    assert script.balanced(frames).tolist() == [0.5, 0.5, 0.5, 0.5, 1.0]

@@ -42,9 +42,9 @@ def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[As
 def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
-    A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
-    ``training/confidence.py --refined`` on synthetic suites and real clips; docs/method/confidence.md has which, and
-    what it is worth on others. A plain object has no landmarks, and keeps the confidence of its rendering.
+    A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. It was fitted
+    to synthetic suites and one real clip; docs/method/confidence.md says which, and what it is worth on others. A plain
+    object has no landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -74,7 +74,7 @@ def refined_confidence_features(rendering: float, support: LandmarkSupport) -> d
     return {
         "rendering": _log_odds(min(max(rendering, 0.01), 0.99)),
         "share": _log_odds(min(max(share, _EVEN), _NEARLY_ALL)),
-        "landmarks": math.log1p(support.agreeing),
+        "landmarks": math.log1p(min(support.agreeing, _ENOUGH)),
     }
 
 

@@ -162,8 +162,8 @@ def open_scene(
 def _is_adjusted(run: RunReader) -> bool:
     """Whether the estimates are refined ones that landmarks have adjusted.
 
-    On 19 runs of the standard suite another refinement of such a run moved no measure of its points by more than .02
-    for the better or the worse, and took most of the time.
+    Another refinement of such a run took most of the time, and on 19 runs of the standard suite the share of points
+    within 1 to 16 pixels was the same with it (mean .72): .02 more or less, and .09 less in one run.
     """
     return any(one.refined and "landmark_matches" in one.diagnostics for one in run.frames)
 

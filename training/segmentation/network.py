@@ -18,8 +18,8 @@ MULTIPLE = 32
 CHANNELS = (
     "red", "green", "blue", "mask", "colours", "motion", "first", "cues",
 )  # fmt: skip
-"""The input: RGB less 0.5; the carried mask or the filled box, 0 to 1 (0.5 where unknown); log-odds of the colours and
-of the motion divided by 3 (0 where unknown); 1 if the mask channel is a box, 1 if there are colours."""
+"""The input: RGB less 0.5; the carried mask or the filled box, 0 to 1; log-odds of the colours divided by 3 and the
+motion cue divided by 2, 0 where unknown; 1 if the mask channel is a box; 1 if there are colours."""
 
 OUTPUTS = ("object", "occluder")
 """Logits: of the object as far as it is visible, and of what lies in front of it."""

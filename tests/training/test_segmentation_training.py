@@ -1,0 +1,109 @@
+"""The training of the segmentation network: its answer has the size of the crop, its losses mean what they say."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+FOLDER = Path(__file__).resolve().parents[2] / "training" / "segmentation"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def training_modules():
+    """The scripts import each other by plain names, as Python does in the folder of a script."""
+    before = set(sys.modules)
+    sys.path.insert(0, str(FOLDER))
+    yield
+    sys.path.remove(str(FOLDER))
+    for name in set(sys.modules) - before:
+        if str(FOLDER) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+def disc(radius: float) -> torch.Tensor:
+    rows, columns = np.mgrid[:64, :64]
+    return torch.tensor(np.hypot(rows - 32, columns - 32) < radius, dtype=torch.float32)[None]
+
+
+@pytest.mark.parametrize("size", [(64, 96), (160, 160)])
+def test_the_network_answers_with_two_maps_of_the_size_of_the_crop(size):
+    from network import CHANNELS, SegmentationNetwork
+
+    network = SegmentationNetwork().eval()
+    with torch.no_grad():
+        assert network(torch.rand(2, len(CHANNELS), *size)).shape == (2, 2, *size)
+    assert sum(one.numel() for one in network.parameters()) < 2e6
+
+
+def test_folded_normalizations_change_no_answer():
+    from network import CHANNELS, SegmentationNetwork, fold_batch_norms
+
+    torch.manual_seed(0)
+    network, crops = SegmentationNetwork(), torch.rand(4, len(CHANNELS), 64, 64)
+    with torch.no_grad():
+        for _ in range(20):
+            network.train()(crops)
+        expected = network.eval()(crops)
+        folded = fold_batch_norms(network)
+        assert not any(isinstance(one, torch.nn.BatchNorm2d) for one in folded.modules())
+        assert torch.allclose(folded(crops), expected, atol=1e-3 * float(expected.abs().max()))
+
+
+def test_the_loss_is_least_for_the_truth_and_ignores_what_is_not_known():
+    from loss import map_loss
+
+    truth, one = disc(20), torch.ones(1)
+    right, wrong = (8 * (2 * mask - 1) for mask in (truth, disc(10)))
+    assert map_loss(right, truth, one, 0.5) < 0.1 < map_loss(wrong, truth, one, 0.5)
+    both = torch.cat([right, wrong]), torch.cat([truth, truth])
+    assert map_loss(*both, torch.tensor([1.0, 0.0]), 0.5) == pytest.approx(
+        float(map_loss(right, truth, one, 0.5))
+    )
+
+
+def test_the_loss_weighs_an_error_at_the_outline_more_than_one_deep_inside():
+    from loss import map_loss
+
+    truth, one = disc(20), torch.ones(1)
+    right = 4 * (2 * truth - 1)
+    at_outline, inside = right.clone(), right.clone()
+    at_outline[0, 32, 32 + 18] *= -1
+    inside[0, 32, 32] *= -1
+    assert map_loss(at_outline, truth, one, 0.0) > map_loss(inside, truth, one, 0.0)
+
+
+def test_intersection_over_union_counts_pixels_and_is_one_if_both_are_empty():
+    from loss import intersection_over_union
+
+    one, two = disc(20), disc(10)
+    found = intersection_over_union(torch.cat([two, two, 0 * one]) - 0.5, torch.cat([one, two, 0 * one]))
+    assert found.tolist() == pytest.approx([float(two.sum() / one.sum()), 1.0, 1.0])
+
+
+def test_a_mask_without_mistakes_stays_and_strong_mistakes_leave_it_a_mask():
+    from mask_errors import damaged
+
+    truth = disc(20)[0].numpy()
+    image = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    overlaps = []
+    for seed in range(30):
+        found = damaged(truth, image, [], np.random.default_rng(seed), 1.0)
+        assert found.shape == truth.shape and found.min() >= 0 and found.max() <= 1
+        overlaps.append(float((np.minimum(found, truth).sum()) / np.maximum(found, truth).sum()))
+    assert max(overlaps) == pytest.approx(1.0, abs=1e-6)  # some have no mistake
+    assert np.mean(np.array(overlaps) < 0.95) > 0.3
+
+
+def test_the_learning_rate_rises_stays_and_falls_to_nothing():
+    from recipe import Recipe
+    from train import learning_rate
+
+    recipe = Recipe(
+        photos="a", masks="b", pool="c", steps=1000, warm_up=100, cool_down=0.3, learning_rate=1.0
+    )
+    rates = [learning_rate(step, recipe) for step in (0, 50, 100, 700, 850, 1000)]
+    assert rates == pytest.approx([0.0, 0.5, 1.0, 1.0, 0.5, 0.0])
