@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from network import CHANNELS
-from scenes import CANVAS, PLANES
+from scene_sequences import CANVAS, PLANES
 
 CROP = 1.4
 """Side of the crop in longer sides of the box."""

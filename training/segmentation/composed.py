@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from layers import Motion, alpha_of, paste, placed, shadow_of, smeared, warp
 from occluders import cut_sign, draw_gripper, draw_hand, with_arm
 from photometry import Camera, light_over
-from scenes import CANVAS, OBJECT, Frame, Scene, background_frames
+from scene_sequences import CANVAS, OBJECT, Frame, Scene, background_frames
 
 Image = NDArray[np.uint8]
 Map = NDArray[np.float32]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from composed import Material, composed_scene
 from cutouts import Masked, cut_out, read_masked, touched_sides, with_hands
 from recipe import Recipe, read_recipe
-from scenes import CANVAS, PLANES, sample_of, still_scene
+from scene_sequences import CANVAS, PLANES, sample_of, still_scene
 from split import held_out
 
 CUTOUT = 150

@@ -10,7 +10,7 @@ from torch import nn
 from batches import Given, SamplePool, box_of, jittered, network_input
 from loss import intersection_over_union
 from network import SIZE
-from scenes import PLANES
+from scene_sequences import PLANES
 
 MEASURES = (
     "still_box", "still_all", "still_carried", "composed_box", "composed_all", "composed_carried",
