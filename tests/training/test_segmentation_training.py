@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from script_folders import scripts_of
 
 FOLDER = Path(__file__).resolve().parents[2] / "training" / "segmentation"
 
 
 @pytest.fixture(autouse=True, scope="module")
 def training_modules():
-    """The scripts import each other by plain names, as Python does in the folder of a script."""
-    before = set(sys.modules)
-    sys.path.insert(0, str(FOLDER))
-    yield
-    sys.path.remove(str(FOLDER))
-    for name in set(sys.modules) - before:
-        if str(FOLDER) in str(getattr(sys.modules[name], "__file__", "")):
-            del sys.modules[name]
+    with scripts_of(FOLDER):
+        yield
 
 
 def disc(radius: float) -> torch.Tensor:
