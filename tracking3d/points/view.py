@@ -131,28 +131,43 @@ def sample(plane: Plane, xy: Array) -> Plane:
     return np.where(finite, values, 0).astype(np.float32)
 
 
-def open_view(
-    image: NDArray[np.uint8],
+@dataclass(frozen=True, eq=False)
+class GreyWindow:
+    """A window of a frame around the object, into which no surface is drawn yet.
+
+    Attributes:
+        image: ``(h, w)`` uint8 grey values.
+        mask: ``(h, w)`` uint8, 255 on the object.
+        corner: Left and upper edge of the window in the frame.
+        scale: ``(2,)`` window pixels per frame pixel.
+    """
+
+    image: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    corner: tuple[int, int]
+    scale: Array
+
+
+def cut_window(
+    grey: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     camera: Camera,
     T_cam_obj: Array,
     vertices: Array,
-    faces: NDArray[np.int64],
     longest_side: int = LONGEST_SIDE,
-) -> SurfaceView | None:
+) -> GreyWindow | None:
     """The window of a frame around its mask and the projected mesh.
 
     Args:
-        image: ``(H, W, 3)`` RGB.
+        grey: ``(H, W)`` grey values, or ``(H, W, 3)`` RGB.
         mask: ``(H, W)``.
         camera: The camera of the frame.
         T_cam_obj: ``(4, 4)``.
         vertices: ``(V, 3)``.
-        faces: ``(F, 3)``.
         longest_side: Pixels of the window; a larger one is scaled down.
 
     Returns:
-        The view, or None if the pose is no number or nothing of the object lies in the frame.
+        The window, or None if the pose is no number or nothing of the object lies in the frame.
     """
     if not np.isfinite(T_cam_obj).all():
         return None
@@ -169,20 +184,68 @@ def open_view(
     if (high - low < 8).any():
         return None
     (left, top), (right, bottom) = low.tolist(), high.tolist()
-    grey = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_RGB2GRAY).astype(np.float32)
-    inside = mask[top:bottom, left:right].astype(np.float32)
-    factor = min(1.0, longest_side / max(grey.shape))
+    image = grey[top:bottom, left:right]
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    inside = mask[top:bottom, left:right].astype(np.uint8) * np.uint8(255)
+    factor = min(1.0, longest_side / max(image.shape))
     width, height = (max(round(side * factor), 8) for side in (right - left, bottom - top))
     if factor < 1:
-        grey, inside = (cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (grey, inside))
+        image, inside = (
+            cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (image, inside)
+        )
     scale = np.array([width / (right - left), height / (bottom - top)])
-    centre = (whole[2:] + 0.5 - (left, top)) * scale - 0.5
-    empty = np.zeros((height, width), np.float32)
+    return GreyWindow(np.array(image, np.uint8), inside, (left, top), scale)
+
+
+def draw_into_window(
+    window: GreyWindow, camera: Camera, T_cam_obj: Array, vertices: Array, faces: NDArray[np.int64]
+) -> SurfaceView:
+    """A window with the mesh drawn into it.
+
+    Args:
+        window: The window.
+        camera: The camera of the frame.
+        T_cam_obj: ``(4, 4)``.
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+    """
+    centre = (np.array([camera.cx, camera.cy]) + 0.5 - np.array(window.corner)) * window.scale - 0.5
+    focal = np.array([camera.fx, camera.fy]) * window.scale
+    image = cv2.GaussianBlur(window.image.astype(np.float32), (0, 0), 0.5)
+    empty = np.zeros(image.shape, np.float32)
     view = SurfaceView(
-        cv2.GaussianBlur(grey, (0, 0), 0.5), inside, (left, top), scale,
-        np.concatenate([whole[:2] * scale, centre]), T_cam_obj, empty, empty,
+        image, window.mask.astype(np.float32) / np.float32(255), window.corner, window.scale,
+        np.concatenate([focal, centre]), T_cam_obj, empty, empty,
     )  # fmt: skip
     return redraw_surface(view, vertices, faces, T_cam_obj)
+
+
+def open_view(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    camera: Camera,
+    T_cam_obj: Array,
+    vertices: Array,
+    faces: NDArray[np.int64],
+    longest_side: int = LONGEST_SIDE,
+) -> SurfaceView | None:
+    """The window of a frame around its mask and the projected mesh, with the mesh drawn into it.
+
+    Args:
+        image: ``(H, W, 3)`` RGB.
+        mask: ``(H, W)``.
+        camera: The camera of the frame.
+        T_cam_obj: ``(4, 4)``.
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        longest_side: Pixels of the window; a larger one is scaled down.
+
+    Returns:
+        The view, or None if the pose is no number or nothing of the object lies in the frame.
+    """
+    window = cut_window(image, mask, camera, T_cam_obj, vertices, longest_side)
+    return None if window is None else draw_into_window(window, camera, T_cam_obj, vertices, faces)
 
 
 def redraw_surface(

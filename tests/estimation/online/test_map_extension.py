@@ -10,8 +10,8 @@ import pytest
 from online_runs import FRAMES, Run, estimate_of, frame, run, solver, true_mask, turning_clip, with_true_masks
 
 from tracking3d.estimation.gap import Gap
-from tracking3d.estimation.online.atlas.atlas import with_lens_of
 from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
 from tracking3d.evaluation.metrics import aligned_rotation_errors
@@ -152,7 +152,7 @@ def test_refinement_starts_from_the_poses_that_were_found():
 def test_a_second_initialization_that_finds_another_lens_moves_the_lost_map_to_it():
     state = with_inactive_map(known()[0], 0, 3)
     longer = state.camera.zoom(1.5, "found later")
-    moved = with_lens_of(state, replace(state, camera=longer))
+    moved = state_through_lens(state, longer)
     assert moved.camera == longer
     for views, other in (
         (moved.object_map.keyframes, state.object_map.keyframes),
@@ -170,7 +170,7 @@ def test_a_second_initialization_that_finds_another_lens_moves_the_lost_map_to_i
 
 def test_the_same_lens_moves_nothing():
     state = known()[0]
-    assert with_lens_of(state, state) is state
+    assert state_through_lens(state, state.camera) is state
 
 
 def test_the_solver_extends_maps():

@@ -16,6 +16,7 @@ from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
 from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, fit_pose, pose_evidence
 from tracking3d.geometry.camera import Camera
@@ -55,6 +56,8 @@ def estimate_pending_frames(
         fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
         if view.index == first.index:
             fit = replace(fit, pose=starts[start.origin])
+        else:
+            fit = replace(fit, pose=resect_pose(state.object_map, state.camera, view, fit.pose))
         kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
         evidence = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
         found = PoseCandidate(view, fit, start.origin, kept, evidence, assess_pose(fit, usual, evidence))

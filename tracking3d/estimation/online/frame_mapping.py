@@ -13,11 +13,13 @@ from tracking3d.estimation.online.continued_refinement import ContinuedRefinemen
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, needs_keyframe
+from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
 from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
 from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.state.confidence import is_high_loss
 from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import (
     TRAJECTORY_LENGTH,
     advance,
@@ -41,6 +43,9 @@ class FrameMapping(ContinuedRefinement):
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
         found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
+        if not found.lost:
+            pose = resect_pose(state.object_map, state.camera, found.view, found.fit.pose)
+            found = replace(found, fit=replace(found.fit, pose=pose))
         usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
         reliable = usual or found.evidence.is_decisive
         is_keyframe = not found.lost and reliable and needs_keyframe(state.object_map, found, self.online)
@@ -59,7 +64,7 @@ class FrameMapping(ContinuedRefinement):
                 updated = replace(
                     updated, object_map=object_map, surface=surface, last_pose=last, tracked_points=followed
                 )
-                updated = fix_depth_reversal(updated, self.online)
+                updated = refine_by_landmarks(fix_depth_reversal(updated, self.online))
                 updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
 from tracking3d.estimation.online.mapping.local_mapping import mask_weight
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.relocalization.pose_search import ROTATION_SEARCH, relocalize, should_retry
@@ -126,7 +127,8 @@ class FrameTracker(SolverBase):
         on_object = followed.only(~state.object_map.candidate[followed.landmark])
         observation = self._observe(state, frame, mask, pose)
         weight = 1.0 if self.config.object.trust_masks else mask_weight(mask, on_object)
-        return Keyframe(observation, mask, pose, followed, mask_weight=weight)
+        window = cut_around_object(state.object_map, state.camera, frame.image, mask, pose)
+        return Keyframe(observation, mask, pose, followed, mask_weight=weight, image=window)
 
     def _observe(
         self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose

@@ -16,13 +16,10 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.gap import Gap, ModelCoverage
-from tracking3d.estimation.online.atlas.atlas import (
-    activate_largest_map,
-    frames_of_map,
-    inactive_map_through_lens,
-)
+from tracking3d.estimation.online.atlas.atlas import activate_largest_map, frames_of_map
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.frame_mapping import FrameMapping
+from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.mapping.keyframe_culling import prune_landmarks
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
@@ -167,7 +164,8 @@ def _leave(state: SolverState, gap: Gap, number: int) -> SolverState:
             index = gap.anchor.index + sign * (index - number)
         found[index] = replace(view, observation=replace(view.observation, index=index))
     keyframes = tuple(found[index] for index in sorted(found))
-    object_map = prune_landmarks(replace(state.object_map, keyframes=keyframes), FollowedPoints.none())[0]
+    object_map = replace(state.object_map, keyframes=keyframes, asked_landmarks=-1)
+    object_map = prune_landmarks(object_map, FollowedPoints.none())[0]
     return replace(
         state,
         object_map=object_map,

@@ -37,7 +37,6 @@ from tracking3d.estimation.online.atlas.atlas import (
     refine_inactive_map,
     switch_map,
     transform_estimates,
-    with_lens_of,
 )
 from tracking3d.estimation.online.atlas.map_alignment import merge_maps
 from tracking3d.estimation.online.atlas.reinitialization import (
@@ -52,8 +51,11 @@ from tracking3d.estimation.online.first_estimates import estimate_pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
 from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points, refine_local_map
+from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
+from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
 from tracking3d.estimation.online.masks.mask_agreement import mask_agreement, measure_mask_agreement
@@ -121,7 +123,8 @@ class OnlineSolver(MapExtension):
             channels = feature_channels(self.encoder, self.config.object.texture_channels)
             space = FeatureSpace.of(observation.features, observation.mask, channels)
         observation = replace(observation, features=space.project(observation.features))
-        view = Keyframe(observation, binary, pose, FollowedPoints.none())
+        window = cut_around_object(object_map, camera, frame.image, binary, pose)
+        view = Keyframe(observation, binary, pose, FollowedPoints.none(), image=window)
         object_map, view = insert_points(object_map, camera, view, image)
         estimate = initial_estimate(frame, binary, pose, camera)
         state = replace(
@@ -250,6 +253,7 @@ class OnlineSolver(MapExtension):
             updated = replace(
                 state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
             )
+            updated = refine_by_landmarks(updated)
             if self.config.has_given_masks:
                 updated = measure_mask_agreement(updated)
             updated, revised = estimate_pending_frames(
@@ -290,7 +294,7 @@ class OnlineSolver(MapExtension):
             return replace(state, reinitialization=begun), estimate
         if not is_reliable(begun, again):
             return replace(state, reinitialization=None), estimate
-        state = with_lens_of(state, begun)
+        state = state_through_lens(state, begun.camera)
         similarity = guess_alignment(state, begun)
         switched = switch_map(state, begun, similarity)
         again = transform_estimates(again, similarity, state.camera)

@@ -17,7 +17,7 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.atlas.map_merging import transform_map, transform_pose
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.focal_length import map_through_lens, pose_through_lens
+from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
@@ -32,23 +32,6 @@ _UNALIGNED_REASON = (
     "re-initialized after tracking was lost; the pose relative to the earlier map is unknown until a known side is "
     "seen"
 )
-
-
-def with_lens_of(state: SolverState, begun: SolverState) -> SolverState:
-    """The state with a lost map as seen with the focal length that a second initialization found."""
-    before, after = state.camera, begun.camera
-    factor = after.fy / before.fy
-    if factor == 1:
-        return state
-    object_map = map_through_lens(state.object_map, before, after)
-    return replace(
-        state,
-        camera=after,
-        object_map=object_map,
-        surface=object_map.surface(),
-        trajectory=tuple((pose_through_lens(pose, factor), index) for pose, index in state.trajectory),
-        inactive_maps=tuple(inactive_map_through_lens(other, before, after) for other in state.inactive_maps),
-    )
 
 
 def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
@@ -203,13 +186,6 @@ def refine_inactive_map(
     other = inactive_map_through_lens(other, before, after)
     object_map, _ = refine_globally(other.object_map, replace(after, assumed=False), config)
     return replace(other, object_map=object_map, surface=object_map.surface(), unaligned=True)
-
-
-def inactive_map_through_lens(other: InactiveMap, before: Camera, after: Camera) -> InactiveMap:
-    """An inactive map as seen with another focal length."""
-    if after == before:
-        return other
-    return replace(other, object_map=map_through_lens(other.object_map, before, after))
 
 
 def _with_active_map(

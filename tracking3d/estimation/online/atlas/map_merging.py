@@ -99,7 +99,8 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
         first,
         landmarks=np.concatenate([first.landmarks, second.landmarks]),
         candidate=np.concatenate([first.candidate, second.candidate]),
-        keyframes=cull_keyframes(tuple(keyframes), most),
+        keyframes=tuple(replace(view, is_adjusted=False) for view in cull_keyframes(tuple(keyframes), most)),
+        asked_landmarks=-1,
         pointless=first.pointless and second.pointless,
         started_at_rest=first.started_at_rest or second.started_at_rest,
     )

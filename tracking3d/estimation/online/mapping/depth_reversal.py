@@ -107,7 +107,10 @@ def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, O
     vertices = object_map.vertices.double().cpu().numpy()
     surface = torch.from_numpy(reversal.surface(vertices, start.points, found.points)).to(object_map.vertices)
     poses = (pose_from_arrays(R, t, object_map.vertices) for R, t in zip(found.R, found.t, strict=True))
-    keyframes = tuple(replace(view, pose=pose, texture=None) for view, pose in zip(views, poses, strict=True))
+    keyframes = tuple(
+        replace(view, pose=pose, texture=None, is_adjusted=False)
+        for view, pose in zip(views, poses, strict=True)
+    )
     return reversal, replace(object_map, vertices=surface, landmarks=landmarks, keyframes=keyframes)
 
 

@@ -16,6 +16,7 @@ from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.config.camera import USUAL_ANGLES
 from tracking3d.estimation.online.mapping.local_mapping import shared_landmarks, structure_of, tracks_of
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 
@@ -48,7 +49,8 @@ def with_focal_length(view: Keyframe, before: Camera, after: Camera) -> Keyframe
     K = view.observation.K.clone()
     K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
     pose = pose_through_lens(view.pose, factor)
-    return replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None)
+    observation = replace(view.observation, K=K)
+    return replace(view, pose=pose, observation=observation, texture=None, is_adjusted=False)
 
 
 def pose_through_lens(pose: Pose, factor: float) -> Pose:
@@ -61,6 +63,37 @@ def map_through_lens(object_map: ObjectMap, before: Camera, after: Camera) -> Ob
     """A map as seen with another focal length: depths scale with it, the object keeps its size."""
     keyframes = tuple(with_focal_length(view, before, after) for view in object_map.keyframes)
     return replace(object_map, keyframes=keyframes)
+
+
+def inactive_map_through_lens(other: InactiveMap, before: Camera, after: Camera) -> InactiveMap:
+    """An inactive map as seen with another focal length."""
+    if after == before:
+        return other
+    return replace(other, object_map=map_through_lens(other.object_map, before, after))
+
+
+def state_through_lens(state: SolverState, after: Camera) -> SolverState:
+    """The state with its maps and poses as seen with another focal length."""
+    before = state.camera
+    factor = after.fy / before.fy
+    if factor == 1:
+        return state
+
+    def moved(at: tuple[Pose, int]) -> tuple[Pose, int]:
+        return pose_through_lens(at[0], factor), at[1]
+
+    object_map = map_through_lens(state.object_map, before, after)
+    return replace(
+        state,
+        camera=after,
+        object_map=object_map,
+        surface=object_map.surface(),
+        last_pose=moved(state.last_pose),
+        previous_pose=state.previous_pose and moved(state.previous_pose),
+        trajectory=tuple(map(moved, state.trajectory)),
+        motion_references=(),
+        inactive_maps=tuple(inactive_map_through_lens(other, before, after) for other in state.inactive_maps),
+    )
 
 
 def lens_change(factor: float) -> float:

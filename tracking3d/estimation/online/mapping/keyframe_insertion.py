@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,4 +108,10 @@ def refine_local_map(
         prior=config.surface_prior,
         bundle_iterations=bundle_iterations,
         rounds=rounds,
+        fixed=max(1, _leading_adjusted(object_map, positions)),
     )
+
+
+def _leading_adjusted(object_map: ObjectMap, positions: list[int]) -> int:
+    """How many of the first keyframes at some positions have poses that dense landmarks have adjusted."""
+    return len(list(takewhile(lambda position: object_map.keyframes[position].is_adjusted, positions)))

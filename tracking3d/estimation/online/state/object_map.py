@@ -17,6 +17,8 @@ from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
+from tracking3d.points.landmark_adjustment import LandmarkScene
+from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
 
 
@@ -33,6 +35,8 @@ class Keyframe:
         texture: The frame's back-projected feature texture, as last computed; None before.
         mask_weight: How far the mask is trusted, in [0, 1].
         strength: Texture strength inside the mask, if it was computed; see `texture_strength`.
+        image: The image around the object, for dense landmarks; None if there is no mask.
+        is_adjusted: Whether dense landmarks have adjusted the pose, so that local mapping keeps it.
     """
 
     observation: Observation
@@ -44,6 +48,8 @@ class Keyframe:
     texture: BackProjection | None = None
     mask_weight: float = 1.0
     strength: float = math.inf
+    image: GreyWindow | None = None
+    is_adjusted: bool = False
 
     @property
     def index(self) -> int:
@@ -70,6 +76,8 @@ class ObjectMap:
             fixed, and its surface points count as seen often. 0 if the map is built from the video.
         started_at_rest: Whether the object was still when tracking began: until it has turned, the things next to it
             move in the image as it does.
+        asked_landmarks: Index of the newest keyframe when dense landmarks were last asked to refine the map; -1 if they
+            never were.
     """
 
     shape: Shape
@@ -83,6 +91,7 @@ class ObjectMap:
     candidates_around: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
     fixed_keyframes: int = 0
     started_at_rest: bool = False
+    asked_landmarks: int = -1
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:
@@ -91,6 +100,18 @@ class ObjectMap:
         for view in self.keyframes:
             count[view.points.landmark] += 1
         return count
+
+    @cached_property
+    def landmark_scene(self) -> LandmarkScene:
+        """Surface and keyframes for dense landmarks; see `tracking3d.estimation.online.mapping.keyframe_views`.
+
+        Its views are drawn, and written here, when they are first needed: most never are, since each new keyframe makes
+        another map.
+        """
+        vertices = self.vertices.detach().double().cpu().numpy()
+        return LandmarkScene(
+            [None] * len(self.keyframes), vertices, self.shape.faces.cpu().numpy().astype(np.int64)
+        )
 
     @property
     def radius(self) -> float:

@@ -17,6 +17,7 @@ from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
+from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import Surface
 from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
@@ -164,5 +165,6 @@ ONLINE_CLASSES = (
     FollowedPoints,
     Keypoints,
     LossBaseline,
+    GreyWindow,
 )
 """The classes that a `SolverState` consists of, besides `tracking3d.estimation.solver.STATE_CLASSES`."""
