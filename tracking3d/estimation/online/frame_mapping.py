@@ -64,7 +64,7 @@ class FrameMapping(ContinuedRefinement):
                 updated = replace(
                     updated, object_map=object_map, surface=surface, last_pose=last, tracked_points=followed
                 )
-                updated = refine_by_landmarks(fix_depth_reversal(updated, self.online))
+                updated = refine_by_landmarks(fix_depth_reversal(updated, self.online), self.online)
                 updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)

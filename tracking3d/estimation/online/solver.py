@@ -253,7 +253,7 @@ class OnlineSolver(MapExtension):
             updated = replace(
                 state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
             )
-            updated = refine_by_landmarks(updated)
+            updated = refine_by_landmarks(updated, self.online)
             if self.config.has_given_masks:
                 updated = measure_mask_agreement(updated)
             updated, revised = estimate_pending_frames(

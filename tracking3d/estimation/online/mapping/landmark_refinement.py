@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens, state_through_lens
 from tracking3d.estimation.online.mapping.keyframe_views import draw_keyframes
-from tracking3d.estimation.online.mapping.local_mapping import surface_places, tracks_of
+from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
@@ -30,24 +32,27 @@ _LEAST_KEYFRAMES = 4
 _NEW_SHARE = 0.1
 """Share of the keyframes that are new, from which on the map is refined again: a refinement takes time for every
 keyframe, so that a frame of a long video costs as much as one of a short one."""
+_SHAPE_ROUNDS = 2
+"""Of the surface fit afterwards: dense landmarks leave the rim of the surface where they found it."""
 _TRACK_DEVIATION = 1.0  # pixels, of points that were tracked from frame to frame
 _HELD = 0.05  # deviation of the map's landmarks from the surface, in radii
 
 
-def refine_by_landmarks(state: SolverState) -> SolverState:
+def refine_by_landmarks(state: SolverState, config: OnlineConfig) -> SolverState:
     """The state with map, camera and last pose refined by dense landmarks; unchanged if these say too little.
 
     Nothing happens before enough keyframes are new.
 
     Args:
         state: The state after a keyframe was inserted.
+        config: The solver's options.
     """
     object_map = state.object_map
     if object_map.pointless or object_map.fixed_keyframes or not _is_due(object_map):
         return state
     newest = object_map.keyframes[-1].index
     object_map = replace(object_map, asked_landmarks=newest)
-    refined = _refine_map(object_map, state.camera)
+    refined = _refine_map(object_map, state.camera, config)
     if refined is None:
         return replace(state, object_map=object_map)
     object_map, camera = refined
@@ -64,7 +69,9 @@ def _is_due(object_map: ObjectMap) -> bool:
     return count >= _LEAST_KEYFRAMES and new >= max(1.0, _NEW_SHARE * count)
 
 
-def _refine_map(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera] | None:
+def _refine_map(
+    object_map: ObjectMap, camera: Camera, config: OnlineConfig
+) -> tuple[ObjectMap, Camera] | None:
     """The refined map in the object frame of its first keyframe, and the camera; None if landmarks say too little."""
     scene = draw_keyframes(object_map, camera, list(range(len(object_map.keyframes))))
     if scene.views[0] is None or sum(view is not None for view in scene.views) < _LEAST_KEYFRAMES:
@@ -75,7 +82,10 @@ def _refine_map(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camer
     if scene.focal_factor != 1:
         solved = camera.with_solved_focal(scene.focal_factor)
         object_map, camera = map_through_lens(object_map, camera, solved), solved
-    return _with_texture(_triangulate(_take_over(object_map, scene), camera)), camera
+    object_map = _triangulate(_take_over(object_map, scene), camera)
+    everything = list(range(len(object_map.keyframes)))
+    object_map = fit_shape(object_map, everything, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
+    return _with_texture(object_map), camera
 
 
 def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
