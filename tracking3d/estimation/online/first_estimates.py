@@ -56,8 +56,6 @@ def estimate_pending_frames(
         fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
         if view.index == first.index:
             fit = replace(fit, pose=starts[start.origin])
-        else:
-            fit = replace(fit, pose=resect_pose(state.object_map, state.camera, view, fit.pose))
         kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
         evidence = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
         found = PoseCandidate(view, fit, start.origin, kept, evidence, assess_pose(fit, usual, evidence))
@@ -66,7 +64,11 @@ def estimate_pending_frames(
             found = replace(found, fit=replace(fit, pose=state.object_map.keyframes[-1].pose))
         pose, usual = found.fit.pose, usual.update(found.fit)
         trail.append((pose, view.index))
-        revised.append(make_estimate(state, earlier, found))
+        estimate = make_estimate(state, earlier, found)
+        if all(view.index != other.index for other in state.object_map.keyframes):
+            shown = resect_pose(state.object_map, state.camera, view, pose)
+            estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
+        revised.append(estimate)
         state = learn_colours(state, revised[-1], found)
     return replace(
         state, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]),

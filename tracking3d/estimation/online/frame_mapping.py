@@ -43,9 +43,6 @@ class FrameMapping(ContinuedRefinement):
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
         found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
-        if not found.lost:
-            pose = resect_pose(state.object_map, state.camera, found.view, found.fit.pose)
-            found = replace(found, fit=replace(found.fit, pose=pose))
         usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
         reliable = usual or found.evidence.is_decisive
         is_keyframe = not found.lost and reliable and needs_keyframe(state.object_map, found, self.online)
@@ -81,4 +78,8 @@ class FrameMapping(ContinuedRefinement):
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
         if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
+        if not (found.lost or is_keyframe):
+            # Only what is reported: masks and map follow the pose that fits this surface and these outlines.
+            pose = resect_pose(state.object_map, state.camera, found.view, pose)
+            estimate = replace(estimate, T_cam_obj=pose.matrix().numpy())
         return updated, replace(estimate, keyframe=is_keyframe)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens, state_through_lens
 from tracking3d.estimation.online.mapping.keyframe_views import draw_keyframes
-from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of
+from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of, window_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
@@ -83,8 +83,8 @@ def _refine_map(
         solved = camera.with_solved_focal(scene.focal_factor)
         object_map, camera = map_through_lens(object_map, camera, solved), solved
     object_map = _triangulate(_take_over(object_map, scene), camera)
-    everything = list(range(len(object_map.keyframes)))
-    object_map = fit_shape(object_map, everything, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
+    positions = window_of(len(object_map.keyframes), config.local_window)
+    object_map = fit_shape(object_map, positions, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
     return _with_texture(object_map), camera
 
 
