@@ -170,7 +170,7 @@ def test_beliefs_are_joined_into_one_that_explains_both(solved):
     whole, cost_ratio = merge_submap_states(
         [state, second], [Similarity.identity(), TURN], config.solver, build_encoder(config)
     )
-    assert cost_ratio < 1.05
+    assert cost_ratio < 1.08  # parts joined at a wrong angle are beyond 1.1, see below
     assert len(whole.object_map.keyframes) == 2 * len(state.object_map.keyframes)
     first = {view.index: view.pose.matrix().numpy() for view in whole.object_map.keyframes}
     for view in state.object_map.keyframes:  # what shows the same has the same pose
