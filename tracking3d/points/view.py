@@ -17,6 +17,8 @@ Plane = NDArray[np.float32]
 
 LONGEST_SIDE = 320
 """Pixels of a window, where nothing else is said."""
+LANDMARK_WINDOW = 240
+"""Pixels of the windows in which landmarks are followed that adjust a map or a whole video."""
 MARGIN = 12
 """Frame pixels around mask and mesh that belong to the window."""
 REACH = 12.0
@@ -149,7 +151,7 @@ class GreyWindow:
 
 
 def cut_window(
-    grey: NDArray[np.uint8],
+    image: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     camera: Camera,
     T_cam_obj: Array,
@@ -159,7 +161,7 @@ def cut_window(
     """The window of a frame around its mask and the projected mesh.
 
     Args:
-        grey: ``(H, W)`` grey values, or ``(H, W, 3)`` RGB.
+        image: ``(H, W, 3)`` RGB.
         mask: ``(H, W)``.
         camera: The camera of the frame.
         T_cam_obj: ``(4, 4)``.
@@ -184,18 +186,14 @@ def cut_window(
     if (high - low < 8).any():
         return None
     (left, top), (right, bottom) = low.tolist(), high.tolist()
-    image = grey[top:bottom, left:right]
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_RGB2GRAY)
     inside = mask[top:bottom, left:right].astype(np.uint8) * np.uint8(255)
-    factor = min(1.0, longest_side / max(image.shape))
+    factor = min(1.0, longest_side / max(grey.shape))
     width, height = (max(round(side * factor), 8) for side in (right - left, bottom - top))
     if factor < 1:
-        image, inside = (
-            cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (image, inside)
-        )
+        grey, inside = (cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (grey, inside))
     scale = np.array([width / (right - left), height / (bottom - top)])
-    return GreyWindow(np.array(image, np.uint8), inside, (left, top), scale)
+    return GreyWindow(np.asarray(grey, np.uint8), inside, (left, top), scale)
 
 
 def draw_into_window(

@@ -28,7 +28,7 @@ from tracking3d.points.landmark_adjustment import (
     refine_scene,
 )
 from tracking3d.points.resection import resect
-from tracking3d.points.view import SurfaceView, open_view
+from tracking3d.points.view import LANDMARK_WINDOW, SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
 
@@ -40,8 +40,6 @@ _USUAL_VIEWS = 48
 """Views that are bundled; all that were kept, if these share too few landmarks. With more views the poses of
 box_in_hand were no better, and the time of a round grows with their square."""
 _FRAMES_A_VIEW = 5  # frames of a long video for each view that is bundled
-LONGEST_SIDE = 240
-"""Pixels of the windows in which points are followed."""
 _LEAST_VIEWS = 4
 _Pose = NDArray[np.float64]
 
@@ -178,7 +176,7 @@ class GlobalAdjustment:
 
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
         image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
-        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LONGEST_SIDE)
+        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LANDMARK_WINDOW)
 
     def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
         """A pose of before as it is after what was done to all: the way round of depth, and the lens.

@@ -19,8 +19,7 @@ from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.landmark_adjustment import LandmarkScene, LandmarkSupport
 from tracking3d.points.resection import resect
-from tracking3d.points.view import SurfaceView, open_view
-from tracking3d.reconstruction.global_adjustment import LONGEST_SIDE
+from tracking3d.points.view import LANDMARK_WINDOW, SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
 
@@ -116,5 +115,5 @@ class HeldAdjustment:
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
         image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
         return open_view(
-            image, mask, self.camera, T_cam_obj, self.vertices_of_landmarks, self.faces, LONGEST_SIDE
+            image, mask, self.camera, T_cam_obj, self.vertices_of_landmarks, self.faces, LANDMARK_WINDOW
         )

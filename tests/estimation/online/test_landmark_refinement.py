@@ -194,12 +194,17 @@ def test_local_mapping_keeps_the_poses_that_landmarks_have_adjusted():
 
 
 def between() -> tuple[ObjectMap, Keyframe, Pose]:
-    """A refined map, a frame that did not make it, and its true pose in that map's object frame."""
-    object_map = refine(disturbed()).object_map
-    place = len(object_map.keyframes) // 2
-    view = object_map.keyframes[place]
-    others = object_map.keyframes[:place] + object_map.keyframes[place + 1 :]
-    return replace(object_map, keyframes=others), view, view.pose
+    """A refined map, a frame that did not make it, and its pose with the true rotation in the map's object frame."""
+    state = disturbed()
+    views = state.object_map.keyframes
+    place = len(views) // 2
+    others = replace(state.object_map, keyframes=views[:place] + views[place + 1 :])
+    object_map = refine(replace(state, object_map=others)).object_map
+    R_true = clip().T_cam_obj[[views[0].index, views[place].index], :3, :3]
+    R = R_true[1] @ R_true[0].T @ views[0].pose.matrix().numpy()[:3, :3]
+    tracked_view = tracked().object_map.keyframes[place]
+    t = tracked_view.pose.matrix().numpy()[:3, 3]
+    return object_map, tracked_view, pose_from_arrays(R, t, tracked_view.pose.translation)
 
 
 @pytest.mark.parametrize("degrees", [0.5, 1.2, 2.0])

@@ -91,9 +91,7 @@ def refine_local_map(
     If the object's shape is fixed, only the newest view's texture is added.
     """
     if object_map.fixed_keyframes:
-        newest = object_map.keyframes[-1]
-        newest = replace(newest, texture=object_map.back_project(newest.observation.features, newest))
-        return replace(object_map, keyframes=(*object_map.keyframes[:-1], newest))
+        return object_map.with_textures([len(object_map.keyframes) - 1])
     if object_map.pointless:
         recent = list(range(len(object_map.keyframes)))[-_MAX_KEYFRAMES_WITHOUT_POINTS:]
         return refine_without_points(

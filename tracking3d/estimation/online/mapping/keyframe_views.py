@@ -9,10 +9,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.points.landmark_adjustment import LandmarkScene
-from tracking3d.points.view import GreyWindow, SurfaceView, cut_window, draw_into_window
-
-WINDOW_SIZE = 240
-"""Pixels of the longest side of a window in which dense landmarks are followed."""
+from tracking3d.points.view import LANDMARK_WINDOW, GreyWindow, SurfaceView, cut_window, draw_into_window
 
 
 def cut_around_object(
@@ -34,7 +31,7 @@ def cut_around_object(
     if mask is None or object_map.pointless or object_map.fixed_keyframes:
         return None
     vertices = object_map.landmark_scene.vertices
-    return cut_window(image, mask, camera, pose.matrix().numpy(), vertices, WINDOW_SIZE)
+    return cut_window(image, mask, camera, pose.matrix().numpy(), vertices, LANDMARK_WINDOW)
 
 
 def draw_keyframe(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> SurfaceView | None:

@@ -85,7 +85,7 @@ def _refine_map(
     object_map = _triangulate(_take_over(object_map, scene), camera)
     positions = window_of(len(object_map.keyframes), config.local_window)
     object_map = fit_shape(object_map, positions, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
-    return _with_texture(object_map), camera
+    return object_map.with_textures(), camera
 
 
 def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
@@ -127,16 +127,6 @@ def _triangulate(object_map: ObjectMap, camera: Camera) -> ObjectMap:
         _HELD * object_map.radius,
     )
     return replace(object_map, landmarks=landmarks)
-
-
-def _with_texture(object_map: ObjectMap) -> ObjectMap:
-    return replace(
-        object_map,
-        keyframes=tuple(
-            replace(view, texture=object_map.back_project(view.observation.features, view))
-            for view in object_map.keyframes
-        ),
-    )
 
 
 def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

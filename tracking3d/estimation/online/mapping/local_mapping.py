@@ -222,11 +222,7 @@ def refine_map(
     """
     object_map = _adjust_bundle(object_map, camera, positions, prior, scale, bundle_iterations, fixed)
     object_map = fit_shape(object_map, positions, weights, rounds)
-    keyframes = list(object_map.keyframes)
-    for position in positions:
-        view = keyframes[position]
-        keyframes[position] = replace(view, texture=object_map.back_project(view.observation.features, view))
-    return replace(object_map, keyframes=tuple(keyframes))
+    return object_map.with_textures(positions)
 
 
 def _adjust_bundle(

@@ -70,11 +70,7 @@ def move_to_refined(
     )
     object_map = replace(object_map, vertices=vertices, landmarks=landmarks, keyframes=tuple(keyframes))
     object_map = _fit_new_keyframes(object_map, start.camera, start.refined, config)
-    textured = tuple(
-        replace(view, texture=object_map.back_project(view.observation.features, view))
-        for view in object_map.keyframes
-    )
-    return replace(object_map, keyframes=textured)
+    return object_map.with_textures()
 
 
 def project_landmarks(object_map: ObjectMap, camera: Camera, pose: Pose) -> FollowedPoints:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -134,6 +135,14 @@ class ObjectMap:
             values, valid, self.vertices, self.shape.faces, self.texels, view.pose.R, view.pose.translation, K,
             self.renderer,
         )  # fmt: skip
+
+    def with_textures(self, positions: Iterable[int] | None = None) -> ObjectMap:
+        """The map with the textures of its keyframes back-projected again: of those at some positions, or of all."""
+        keyframes = list(self.keyframes)
+        for position in range(len(keyframes)) if positions is None else positions:
+            view = keyframes[position]
+            keyframes[position] = replace(view, texture=self.back_project(view.observation.features, view))
+        return replace(self, keyframes=tuple(keyframes))
 
     def surface(self) -> Surface:
         """Shape and texture for fitting poses; the texture is the mean over the keyframes."""
