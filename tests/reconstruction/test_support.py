@@ -18,7 +18,7 @@ def test_the_more_of_the_landmarks_agree_the_more_an_answer_is_believed():
     for before in (TRACKED, DOUBTED):
         said = [
             judge_with_landmarks(before, LandmarkSupport(300, count)).confidence
-            for count in (150, 200, 250, 280)
+            for count in (150, 180, 200, 220)
         ]
         assert said == sorted(set(said))
     barely = Assessment(Status.TRACKED, "", 0.81)
@@ -27,6 +27,16 @@ def test_the_more_of_the_landmarks_agree_the_more_an_answer_is_believed():
         < TRACKED_CONFIDENCE
         < judge_with_landmarks(barely, LandmarkSupport(300, 290)).confidence
     )
+
+
+@pytest.mark.parametrize("before", [0.1, 0.5, 0.79, 0.81, 0.99])
+def test_landmarks_never_raise_a_confidence(before):
+    """They have made the pose that they agree with: those of a wrong map agree with each other too."""
+    rendering = Assessment(
+        Status.TRACKED if before >= TRACKED_CONFIDENCE else Status.UNCERTAIN, "doubted", before
+    )
+    for agreeing in range(0, 400, 40):
+        assert judge_with_landmarks(rendering, LandmarkSupport(400, agreeing)).confidence <= before
 
 
 def test_few_that_agree_say_less_than_many():

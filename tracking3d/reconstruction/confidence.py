@@ -1,7 +1,8 @@
 """How far a refined estimate can be trusted, given its landmarks.
 
 The rendering at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
-Landmarks are independent of that: at a wrong pose fewer of the matched ones are inliers.
+At a wrong pose fewer of the matched landmarks are inliers. But landmarks have made the poses that they agree with:
+those of a map that is wrong as a whole agree with each other. So they can lower a confidence, and never raise it.
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[As
 def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
-    A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. It was fitted
-    to synthetic suites and one real clip; docs/method/confidence.md says which, and what it is worth on others. A plain
-    object has no landmarks, and keeps the confidence of its rendering.
+    The confidence is that of the rendering, or a lower one that the landmarks give. The latter is a logistic regression
+    of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. It was fitted to synthetic suites
+    and one real clip; docs/method/confidence.md says which, and what it is worth on others. A plain object has no
+    landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -54,7 +56,7 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
         return rendering
     evidence = refined_confidence_features(rendering.confidence, support)
     odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
-    confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
+    confidence = min(rendering.confidence, 1 / (1 + math.exp(-_INTERCEPT - odds)))
     if confidence >= TRACKED_CONFIDENCE:
         return Assessment(Status.TRACKED, "", confidence)
     reason = rendering.reason
