@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.networks import store
-from tracking3d.networks.catalogue import KnownNetwork
+from tracking3d.networks.catalogue import KnownNetwork, recommended_networks
 
 BYTES = b"an ONNX network, nearly"
 
@@ -87,6 +87,23 @@ def test_get_takes_several_and_goes_on_after_one_that_fails(call, catalogue):
     assert result.exit_code == 2
     assert result.stdout == f"{catalogue / 'closed.onnx'}: closed, mine\n"
     assert "open could not be downloaded" in result.stderr
+
+
+def test_get_recommended_stands_for_the_recommended_networks(call, refused, catalogue, monkeypatch):
+    from tracking3d.networks.catalogue import known_networks
+
+    chosen = [known_networks()["open"].model_copy(update={"recommended": True})]
+    monkeypatch.setattr("tracking3d.networks.catalogue.recommended_networks", lambda: chosen)
+    call("models", "get", "open", "--from", "fetched")
+    assert call("models", "get", "recommended").stdout == f"{catalogue / 'open.onnx'}: open, MIT\n"
+    assert "exactly one NAME" in refused("models", "get", "recommended", "--from", "fetched")
+
+
+def test_what_is_recommended_can_be_downloaded_and_is_small():
+    recommended = recommended_networks()
+    assert [network.name for network in recommended] == ["u2netp", "nanotrack3-backbone", "nanotrack3-head"]
+    assert sum(network.size or 0 for network in recommended) < 8e6
+    assert all(network.addresses and not network.non_commercial for network in recommended)
 
 
 def test_get_all_is_what_has_an_address_and_a_licence_for_everyone(call, catalogue):

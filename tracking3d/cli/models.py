@@ -19,6 +19,9 @@ app = typer.Typer(
     help="List known neural networks, download them into your cache, and verify them.", no_args_is_help=True
 )
 
+_RECOMMENDED = "recommended"
+"""Name that stands for several networks."""
+
 
 @app.command(name="list")
 def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
@@ -46,6 +49,7 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
     for network in networks:
         licence = escape(network.licence) + (" [red]non-commercial[/]" if network.non_commercial else "")
         state = "fetched" if there[network.name] else "manual" if network.address is None else ""
+        state = state or ("recommended" if network.recommended else "")
         size = "" if network.size is None else f"{network.size / 1e6:.1f} MB"
         table.add_row(network.name, escape(network.purpose), size, licence, state)
     print_table(table)
@@ -55,7 +59,11 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
 def get(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME...", help="Network names, as `models list` shows them."),
+        typer.Argument(
+            metavar="NAME...",
+            help="Network names, as `models list` shows them; `recommended` stands for those that make masks better "
+            "at little cost.",
+        ),
     ] = None,
     everything: Annotated[
         bool,
@@ -85,13 +93,18 @@ def get(
 
     A stopped download continues where it stopped. Proxies are read from https_proxy and http_proxy.
     """
-    from tracking3d.networks.catalogue import known_networks
+    from tracking3d.networks.catalogue import known_networks, recommended_networks
     from tracking3d.networks.download import adopt, fetch
     from tracking3d.networks.store import State, find_known, network_path, state_of
 
-    if bool(names) == everything or (file is not None and len(names or ()) != 1):
+    several = names is not None and _RECOMMENDED in names
+    if bool(names) == everything or (file is not None and (several or len(names or ()) != 1)):
         raise InputError("Give one or more NAMEs, or --all; with --from FILE exactly one NAME.")
-    chosen = [find_known(name) for name in names or ()]
+    chosen = [
+        network
+        for name in names or ()
+        for network in (recommended_networks() if name == _RECOMMENDED else [find_known(name)])
+    ]
     if everything:
         fetchable = [network for network in known_networks().values() if network.addresses]
         chosen = [network for network in fetchable if accept_licence or not network.non_commercial]

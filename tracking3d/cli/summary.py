@@ -53,6 +53,8 @@ def print_summary(folder: Path) -> None:
         table.add_row(f"  {stage}", format_value(getattr(stages, stage)))
     if shape := run.get("shape"):
         table.add_row("shape", escape(str(shape)))
+    if advice := _advise_networks(reader.config["tracker"]["name"]):
+        table.add_row("better masks", escape(advice))
     for note in run["notes"]:
         table.add_row("note", f"[yellow]{escape(note)}[/]")
     for what, names in _OUTPUTS.items():
@@ -61,6 +63,24 @@ def print_summary(folder: Path) -> None:
     print_table(table)
 
 
+def _advise_networks(tracker: str) -> str:
+    """What the recommended networks would bring to a run without networks; empty if they are there, or not needed."""
+    from tracking3d.networks.catalogue import recommended_networks
+    from tracking3d.networks.store import State, state_of
+
+    networks = recommended_networks()
+    if tracker not in _WITHOUT_NETWORKS or all(
+        state_of(network, check=False) is not State.ABSENT for network in networks
+    ):
+        return ""
+    size = sum(network.size or 0 for network in networks) / 1e6
+    return (
+        f"`tracking3d models get recommended` ({size:.0f} MB), then --tracker auto; mean IoU of the initial masks "
+        "with the true ones on four real clips: .92, with csrt .86"
+    )
+
+
+_WITHOUT_NETWORKS = {"csrt", "flow"}
 _OUTPUTS = {
     "poses": (layout.FRAMES,),
     "masks": (layout.MASKS,),

@@ -36,6 +36,9 @@ class KnownNetwork(Section):
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
     non_commercial: bool = Field(False, description="Whether its licence forbids commercial use.")
     how: str = Field("", description="How to obtain the file, if there is no address.")
+    recommended: bool = Field(
+        False, description="Whether it is one of those that make masks better at little cost."
+    )
 
     @model_validator(mode="after")
     def _validate_origin(self) -> KnownNetwork:
@@ -45,6 +48,8 @@ class KnownNetwork(Section):
             raise ValueError("mirrors are further addresses; give the first one as address")
         if any(not mirror.startswith(("http://", "https://")) for mirror in self.mirrors):
             raise ValueError("mirrors begin with http:// or https://")
+        if self.address is None and self.recommended:
+            raise ValueError("a network without an address cannot be recommended")
         if self.address is None and not self.how:
             raise ValueError("without an address, how must explain how to obtain the file")
         return self
@@ -64,6 +69,11 @@ def known_networks() -> dict[str, KnownNetwork]:
     """Every known network by name, in the catalogue's order."""
     with resources.as_file(resources.files(__package__) / "catalogue.yaml") as file:
         return read_catalogue(file)
+
+
+def recommended_networks() -> list[KnownNetwork]:
+    """The networks that the tracker ``auto`` uses best, of those that can be downloaded."""
+    return [network for network in known_networks().values() if network.recommended]
 
 
 def read_catalogue(file: Path) -> dict[str, KnownNetwork]:

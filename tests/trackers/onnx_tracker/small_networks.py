@@ -159,6 +159,46 @@ def nano_networks(backbone: Path, head: Path) -> tuple[Path, Path]:
     return backbone, head
 
 
+def nano3_networks(backbone: Path, head: Path) -> tuple[Path, Path]:
+    """The two files of NanoTrack 3 with the real sizes: warm cells score high, and the box keeps its size."""
+    warm = np.zeros((4, 3, 1, 1), np.float32)
+    warm[:] = np.float32([-1, 0, 1]).reshape(1, 3, 1, 1) / 255  # the input is BGR
+    save(
+        backbone,
+        [
+            node("AveragePool", ["input"], ["blocks"], kernel_shape=[16, 16], strides=[16, 16], pads=[0, 0, 1, 1]),
+            node("Conv", ["blocks", "warm"], ["output"]),
+        ],
+        [value("input", FLOAT, [1, 3, 255, 255])],
+        [value("output", FLOAT, [1, 4, 16, 16])],
+        {"warm": warm},
+    )
+    gain = np.zeros((2, 4, 1, 1), np.float32)
+    gain[1] = 2
+    save(
+        head,
+        [
+            node("GlobalAveragePool", ["input1"], ["template"]),
+            node("Mul", ["template", "nothing"], ["faint"]),
+            node("Add", ["input2", "faint"], ["matched"]),
+            node("AveragePool", ["matched"], ["cells"], kernel_shape=[4, 4], strides=[1, 1], pads=[1, 1, 1, 1]),
+            node("Conv", ["cells", "gain"], ["logits"]),
+            node("Sub", ["logits", "half"], ["output1"]),
+            node("Add", ["sides", "zero"], ["output2"]),
+        ],
+        [value("input1", FLOAT, [1, 4, 8, 8]), value("input2", FLOAT, [1, 4, 16, 16])],
+        [value("output1", FLOAT, [1, 2, 15, 15]), value("output2", FLOAT, [1, 4, 15, 15])],
+        {
+            "nothing": np.float32(0),
+            "zero": np.float32(0),
+            "gain": gain,
+            "half": np.float32([0, 3]).reshape(1, 2, 1, 1),
+            "sides": np.full((1, 4, 15, 15), 63.5 / 2, np.float32),
+        },
+    )
+    return backbone, head
+
+
 SALIENCY = """kind: saliency
 input: {size: 64}
 """

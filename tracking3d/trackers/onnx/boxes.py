@@ -1,4 +1,4 @@
-"""Box trackers that propose where the object is: CSR-DCF, or OpenCV's networks NanoTrack and VitTrack."""
+"""Box trackers that propose where the object is: CSR-DCF, or the networks NanoTrack and VitTrack."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+from tracking3d.trackers.onnx.siamese_boxes import SiameseBoxes
 from tracking3d.trackers.opencv_build import why_no_contrib
 
 _LEAST_SIDE = 4  # pixels that a box tracker needs
@@ -82,13 +83,20 @@ class NetworkBoxes:
         return (x, y, width, height) if found and min(width, height) > 0 else None
 
 
-def nano_boxes(backbone: Path, head: Path) -> NetworkBoxes:
-    """NanoTrack from its two ONNX files.
+def nano_boxes(backbone: Path, head: Path, threads: int = 1) -> BoxProposer:
+    """NanoTrack from its two ONNX files; their sizes tell its version.
+
+    Args:
+        backbone: The file of the backbone.
+        head: The file of the head; of versions 1 and 2 it is run by OpenCV, which rejects that of version 3.
+        threads: CPU threads of version 3.
 
     Raises:
-        InputError: If a file is no network that OpenCV can run.
+        InputError: If a file is no such network.
     """
-    return NetworkBoxes(_create(cv2.TrackerNano, backbone, head))
+    if not SiameseBoxes.is_head(head):
+        return NetworkBoxes(_create(cv2.TrackerNano, backbone, head))
+    return SiameseBoxes(backbone, head, threads)
 
 
 def vit_boxes(model: Path) -> NetworkBoxes:

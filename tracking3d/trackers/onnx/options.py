@@ -28,7 +28,7 @@ class OnnxOptions(Options):
     encoder: str | None = Field(None, description="Image encoder: ONNX file or known name.")
     decoder: str | None = Field(None, description="Prompt decoder: ONNX file or known name.")
     box: Literal["csrt", "nano", "vit"] = Field(
-        "csrt", description="Box tracker: CSR-DCF, or OpenCV's NanoTrack or VitTrack from ONNX files."
+        "csrt", description="Box tracker: CSR-DCF, or NanoTrack or VitTrack from ONNX files."
     )
     nano_backbone: str = Field(
         "nanotrack-backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
@@ -40,8 +40,10 @@ class OnnxOptions(Options):
         "vittrack", description="VitTrack's network: ONNX file, or name of a known network."
     )
     csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="Options of CSR-DCF.")
-    every: int = Field(
-        1, ge=1, le=1000, description="Run the network in every k-th frame; flow propagates the mask."
+    every: Annotated[int, Field(ge=1, le=1000)] | Literal["auto"] = Field(
+        1,
+        description="Run the network in every k-th frame, or (auto) if the propagated mask is in doubt, was corrected, "
+        "or has moved or changed much; flow propagates the mask in between.",
     )
     crops: tuple[Annotated[float, Field(ge=1, le=4)], ...] = Field(
         (1.2, 1.5), min_length=1, description="Saliency network: factors by which the box is enlarged."

@@ -14,6 +14,7 @@ from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
 from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
 from tracking3d.trackers.onnx.proposals import PointSegmenter
+from tracking3d.trackers.onnx.schedule import NetworkSchedule
 from tracking3d.trackers.segmentation import ColourSegmentation
 
 _LEAST_SHARPNESS = 0.35  # of a network's mask; below, it has not found anything
@@ -41,7 +42,8 @@ class OnnxTracker:
         self._carried: ColourSegmentation | None = None
         self._judge: ColourJudge
         self._last_box: Box
-        self._frames_since = self._strayed = 0
+        self._schedule = NetworkSchedule(options.every)
+        self._strayed = 0
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -68,7 +70,8 @@ class OnnxTracker:
         self._judge = ColourJudge(image, mask)
         self._carried = ColourSegmentation(image, box, mask > 0.5)
         self._boxes.start(image, box)
-        self._last_box, self._frames_since, self._strayed = box, 0, 0
+        self._last_box, self._strayed = box, 0
+        self._schedule.was_run(box_of(mask))
         return estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
@@ -78,11 +81,11 @@ class OnnxTracker:
         image = frame.image
         box = self._boxes.update(image)
         carried = self._carried.step(image, box)
-        self._frames_since += 1
-        if self._frames_since < self._options.every and not carried.reason:
+        if not self._schedule.is_due(carried, box):
             return carried
-        self._frames_since = 0
-        return self._segment(image, box, carried)
+        estimate = self._segment(image, box, carried)
+        self._schedule.was_run(None if estimate.mask is None else box_of(estimate.mask))
+        return estimate
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Re-anchor the box tracker and the carried mask on ``mask`` ``(H, W)`` in ``frame``."""
@@ -93,6 +96,7 @@ class OnnxTracker:
         self._judge = self._judge.corrected(frame.image, mask.astype(np.float32))
         self._boxes.start(frame.image, box)
         self._last_box, self._strayed = box, 0
+        self._schedule.was_corrected()
 
     def _first_answer(self, image: Image, prompt: Prompt) -> MaskEstimate:
         if prompt.mask is not None:
