@@ -166,7 +166,14 @@ def nano3_networks(backbone: Path, head: Path) -> tuple[Path, Path]:
     save(
         backbone,
         [
-            node("AveragePool", ["input"], ["blocks"], kernel_shape=[16, 16], strides=[16, 16], pads=[0, 0, 1, 1]),
+            node(
+                "AveragePool",
+                ["input"],
+                ["blocks"],
+                kernel_shape=[16, 16],
+                strides=[16, 16],
+                pads=[0, 0, 1, 1],
+            ),
             node("Conv", ["blocks", "warm"], ["output"]),
         ],
         [value("input", FLOAT, [1, 3, 255, 255])],
@@ -181,7 +188,9 @@ def nano3_networks(backbone: Path, head: Path) -> tuple[Path, Path]:
             node("GlobalAveragePool", ["input1"], ["template"]),
             node("Mul", ["template", "nothing"], ["faint"]),
             node("Add", ["input2", "faint"], ["matched"]),
-            node("AveragePool", ["matched"], ["cells"], kernel_shape=[4, 4], strides=[1, 1], pads=[1, 1, 1, 1]),
+            node(
+                "AveragePool", ["matched"], ["cells"], kernel_shape=[4, 4], strides=[1, 1], pads=[1, 1, 1, 1]
+            ),
             node("Conv", ["cells", "gain"], ["logits"]),
             node("Sub", ["logits", "half"], ["output1"]),
             node("Add", ["sides", "zero"], ["output2"]),

@@ -134,7 +134,8 @@ def _next_place(
     frame = np.array([shape[1], shape[0]], float)
     mixed = (1 - rate) * last.size + rate * size[:, row, column] / scale
     return _Place(
-        np.clip(last.centre + centre / scale, 0, frame), np.clip(mixed, _LEAST_SIDE, np.maximum(frame, _LEAST_SIDE))
+        np.clip(last.centre + centre / scale, 0, frame),
+        np.clip(mixed, _LEAST_SIDE, np.maximum(frame, _LEAST_SIDE)),
     )
 
 
