@@ -74,8 +74,8 @@ def test_the_head_tells_the_version(files, tmp_path):
 
 def test_other_networks_are_refused_with_what_to_give(files, tmp_path):
     other = saliency_network(tmp_path / "other.onnx")
-    with pytest.raises(InputError, match=r"other\.onnx is not a network of NanoTrack 3.*its backbone and its head"):
-        InputError, match=r"other\.onnx is not a network of NanoTrack 3.*give its backbone and its head"
+    with pytest.raises(
+        InputError, match=r"other\.onnx is not a network of NanoTrack 3.*its backbone and its head"
     ):
         SiameseBoxes(other, files[1])
 
