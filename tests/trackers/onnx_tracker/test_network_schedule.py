@@ -41,9 +41,9 @@ def test_a_doubtful_mask_is_segmented_before_its_turn(every):
     assert begun(every).is_due(MaskEstimate(None, 0.0, "the object is not visible"), BOX)
 
 
-def test_what_stays_as_it_was_is_propagated_for_nine_frames():
+def test_what_stays_as_it_was_is_propagated_for_five_frames():
     schedule = begun("auto")
-    assert [schedule.is_due(carried(), BOX) for _ in range(9)] == [False] * 8 + [True]
+    assert [schedule.is_due(carried(), BOX) for _ in range(5)] == [False] * 4 + [True]
 
 
 def test_a_falling_score_a_new_size_and_a_box_elsewhere_ask_for_the_network():

@@ -8,7 +8,7 @@ from typing import Literal
 from tracking3d.frames import Box, MaskEstimate
 from tracking3d.trackers.crops import box_iou, box_of
 
-_LONGEST = 10  # frames without a new mask of the network
+_LONGEST = 6  # frames without a new mask of the network
 _DROPPED = 0.85  # of the score right after the network's mask
 _CHANGED = 0.7  # IoU with the box of the network's mask, moved to the same centre
 _APART = 0.1  # drop of the IoU of the mask's box and the box tracker's
@@ -20,7 +20,7 @@ class NetworkSchedule:
 
     Attributes:
         every: It is run in every k-th frame; ``auto``: if something has changed since its last mask, and in every
-            tenth frame.
+            sixth frame.
     """
 
     every: int | Literal["auto"]
