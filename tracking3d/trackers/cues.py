@@ -35,6 +35,7 @@ class Cues:
         background: Whether the pixel has changed against what was seen there before.
         novelty: For the object, within the outline, where nothing else is known: it may be a new side.
         witness: Distance beyond the box tracker's box.
+        network: Log-odds of a segmentation network, if there is one.
         smoother: Whether the edge-aware smoother follows.
     """
 
@@ -47,6 +48,7 @@ class Cues:
     background: float = 1.0
     novelty: float = 2.0
     witness: float = 1.0
+    network: float = 0.0
     smoother: bool = True
 
 

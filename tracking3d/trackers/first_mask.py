@@ -1,4 +1,4 @@
-"""The first mask: the object inside a box, by GrabCut (Rother et al. 2004)."""
+"""The first mask: the object inside a box, by GrabCut (Rother et al. 2004), and by a network if there is one."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tracking3d.trackers.crops import clip_box, crop_window, inside_frame, paste
 
 _SIZE = 288
 _MARGIN = 0.35
+_COLOURS = 0.5  # weight of GrabCut's mask beside the network's
 _LEAST_SHARE = 0.15  # of the box; less is taken for a failure
 _LEAST_CONTRAST = (
     2.0  # standard deviation in grey levels; below, the graph cut takes minutes and means nothing
@@ -39,6 +40,27 @@ def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float
     if np.count_nonzero(mask) < _LEAST_SHARE * np.count_nonzero(candidate):
         mask = _ellipse(rows, columns)
     return paste_mask(mask, window, image.shape)
+
+
+def mask_with_network(image: Image, box: Box, likely: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Segment the object in a box by a network, and by colours with half of its say; deterministic.
+
+    Colours keep to outlines that the network draws too smoothly, and the network knows what belongs together though its
+    colours differ.
+
+    Args:
+        image: ``(H, W, 3)`` RGB.
+        box: ``(x, y, w, h)`` in pixels.
+        likely: ``(H, W)`` in [0, 1], the network's probability.
+
+    Returns:
+        ``(H, W)`` of 0 and 1.
+    """
+    by_colours = mask_in_box(image, box)
+    mask = (likely + _COLOURS * by_colours > (1 + _COLOURS) / 2).astype(np.float32)
+    visible = clip_box(box, image.shape)
+    enough = visible is None or mask.sum() > _LEAST_SHARE * visible[2] * visible[3]
+    return mask if enough else by_colours
 
 
 def _grab_cut(colours: NDArray[np.uint8], candidate: NDArray[np.bool_], iterations: int) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ looks lost. Any box tracker will do. Everything is deterministic and causal.
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from tracking3d.trackers.confidence import Judgement, outline_margin
 from tracking3d.trackers.crops import box_iou, box_of, clip_box, crop_window, outside, paste_mask
 from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
-from tracking3d.trackers.mask_motion import follow_mask
+from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.outline import both_sides, inside_distance, remove_specks, touches_border
 from tracking3d.trackers.search import find_by_colours
@@ -45,6 +46,16 @@ _FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found a
 _Answer = tuple[NDArray[np.float32], Judgement]
 
 
+class PixelClassifier(Protocol):
+    """Says which pixels of a crop are the object."""
+
+    def log_odds(
+        self, image: Image, present: FrameCrop, motion: MaskMotion, colours: GlobalColours, last: Box
+    ) -> NDArray[np.float32]:
+        """``(S, S)`` log-odds of the object in the crop ``present`` of ``image``; ``last`` was its last mask's box."""
+        ...
+
+
 class ColourSegmentation:
     """Follows one object's mask through a video.
 
@@ -54,6 +65,7 @@ class ColourSegmentation:
         mask: ``(H, W)`` bool, the object's first mask; segmented from the box if None.
         size: Side of the working crop in pixels.
         cues: The weights of the evidence.
+        network: A segmentation network as a further cue.
 
     Raises:
         PluginError: If the OpenCV in use lacks `SMOOTHER`.
@@ -66,10 +78,11 @@ class ColourSegmentation:
         mask: NDArray[np.bool_] | None = None,
         size: int = 224,
         cues: Cues | None = None,
+        network: PixelClassifier | None = None,
     ) -> None:
         if why := why_no_contrib(SMOOTHER):
             raise PluginError(f"The colour segmentation cannot be used: {why}.")
-        self._size, self._cues = size, cues or Cues()
+        self._size, self._cues, self._network = size, cues or Cues(), network
         self._image = image
         self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)
         self._velocity = (0, 0)
@@ -144,6 +157,9 @@ class ColourSegmentation:
             else:
                 self._background.move(motion.background, before, present.window)
             evidence += self._cues.background * self._background.change(image, present.window)
+        if self._network is not None:
+            said = self._network.log_odds(image, present, motion, self._colours, box)
+            evidence += self._cues.network * said
         if witness is not None:
             evidence -= self._cues.witness * distance_beyond(witness, present.window)
         mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)

@@ -1,0 +1,1 @@
+"""Masks by a small segmentation network that this project trained and that comes with the package."""

@@ -1,0 +1,177 @@
+"""The segmentation network of the package: which pixels of a crop are the object that a box or the last mask shows.
+
+1.2 million parameters, distilled from MobileSAM on freely licensed photographs and on scenes composed of them;
+``training/segmentation`` has the training, and what each input channel means.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Box, Image
+from tracking3d.geometry.camera import Window
+from tracking3d.networks.session import Network
+from tracking3d.trackers.colour_models import GlobalColours
+from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.cues import FrameCrop
+
+Map = NDArray[np.float32]
+"""``(S, S)`` of a square crop."""
+
+SIZE = 160
+"""Side of the network's crops in pixels."""
+
+_CHANNELS = 8
+_MASK, _COLOURS, _MOTION, _IS_BOX, _HAS_COLOURS = range(3, _CHANNELS)
+_MARGIN = 0.2  # free space around the box, as in training
+_COLOUR_SCALE, _MOTION_SCALE = 3.0, 2.0  # divisors of the log-odds of colours and of the motion cue
+_MOST = 4.0  # log-odds; beyond its crop there is no object
+
+
+class ObjectNetwork:
+    """Runs the network of the package on crops of a video's frames; deterministic.
+
+    Args:
+        threads: CPU threads.
+        file: An ONNX file with the same inputs and outputs, in place of the package's.
+    """
+
+    def __init__(self, threads: int = 1, file: Path | None = None) -> None:
+        with resources.as_file(
+            resources.files("tracking3d.trackers") / "weights" / "segmentation.onnx"
+        ) as own:
+            self._network = Network(file or Path(own), threads)
+
+    def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> Map:
+        """The object in a box, by nothing but one image.
+
+        Every crop is seen twice, the second time mirrored.
+
+        Args:
+            image: ``(H, W, 3)`` RGB.
+            box: ``(x, y, w, h)`` in pixels, at least partly in the image.
+            margins: Free space around the box in each crop, in its longer side.
+
+        Returns:
+            ``(H, W)`` in [0, 1]: the probability of the object, 0 beyond the crops.
+        """
+        visible = clip_box(box, image.shape) or box
+        windows = [Window.around(visible, margin, SIZE) for margin in margins]
+        crops = np.stack([_box_channels(FrameCrop.of(image, window), box) for window in windows])
+        logits = self._run(np.concatenate([crops, crops[..., ::-1]]))[:, 0]
+        both = (logits[: len(windows)] + logits[len(windows) :, :, ::-1]) / 2
+        full = np.zeros(image.shape[:2], np.float32)
+        for window, one in zip(windows, both, strict=True):
+            full += _paste_logits(one, window, image.shape) / len(windows)
+        return _probability(full)
+
+    def log_odds(
+        self,
+        image: Image,
+        carried: Map,
+        motion: Map,
+        window: Window,
+        colours: GlobalColours,
+        boxes: Sequence[Box],
+    ) -> tuple[Map, Map]:
+        """The object in a crop by its last mask, and by a box.
+
+        Args:
+            image: ``(H, W, 3)`` RGB, the present frame.
+            carried: ``(S, S)`` in [0, 1], where the last mask has moved in the crop.
+            motion: ``(S, S)``, the motion cue there.
+            window: The crop.
+            colours: The colours of the object and of its surroundings.
+            box: ``(x, y, w, h)`` in the frame, the other prompt.
+
+        Returns:
+            ``(S, S)`` log-odds within [-4, 4] by the mask, with colours and motion, and by the box.
+        """
+        around = frame_box(carried, window)
+        if around is None:
+            nothing = np.full_like(carried, -_MOST)
+            return nothing, nothing
+        crops = [
+            FrameCrop.of(image, Window.around(clip_box(one, image.shape) or one, _MARGIN, SIZE))
+            for one in (around, box)
+        ]
+        channels = [_image_channels(crops[0]), _box_channels(crops[1], box)]
+        by_mask = crops[0].window
+        channels[0][_MASK] = _resample(carried, window, by_mask)
+        channels[0][_COLOURS] = colours.log_ratio(crops[0].colours) / _COLOUR_SCALE
+        channels[0][_MOTION] = _resample(motion, window, by_mask) / _MOTION_SCALE
+        channels[0][_HAS_COLOURS] = 1
+        logits = self._run(np.stack(channels))[:, 0]
+        seen = [
+            np.clip(_resample(one, crop.window, window, -2 * _MOST), -_MOST, _MOST)
+            for one, crop in zip(logits, crops, strict=True)
+        ]
+        return seen[0], seen[1]
+
+    def _run(self, crops: NDArray[np.float32]) -> NDArray[np.float32]:
+        """``(B, 8, S, S)`` to logits ``(B, 2, S, S)``: the visible object, and what is in front of it."""
+        return self._network.run({"crop": np.ascontiguousarray(crops)})["logits"]
+
+
+def _image_channels(crop: FrameCrop) -> NDArray[np.float32]:
+    channels = np.zeros((_CHANNELS, SIZE, SIZE), np.float32)
+    channels[:3] = crop.image.transpose(2, 0, 1).astype(np.float32) / 255 - 0.5
+    return channels
+
+
+def _box_channels(crop: FrameCrop, box: Box) -> NDArray[np.float32]:
+    """``(8, S, S)``: the crop, and the box ``(x, y, w, h)`` of the frame, filled."""
+    channels = _image_channels(crop)
+    window = crop.window
+    left, top = (box[0] - window.left) * window.scale, (box[1] - window.top) * window.scale
+    right, bottom = left + box[2] * window.scale, top + box[3] * window.scale
+    columns, rows = (
+        slice(max(round(first), 0), max(round(last), 0)) for first, last in ((left, right), (top, bottom))
+    )
+    channels[_MASK, rows, columns] = 1
+    channels[_IS_BOX] = 1
+    return channels
+
+
+def frame_box(mask: Map, window: Window) -> Box | None:
+    """The box ``(x, y, w, h)``, in the frame, of a mask in a window; None if that is empty."""
+    if (box := box_of(mask)) is None:
+        return None
+    x, y, width, height = (value / window.scale for value in box)
+    return window.left + x, window.top + y, width, height
+
+
+def _resample(values: Map, source: Window, target: Window, beyond: float = 0.0) -> Map:
+    """What ``target`` sees of the values in ``source``, ``beyond`` outside of it."""
+    to_source = np.linalg.inv(source.to_frame) @ target.to_frame
+    size = (target.size, target.size)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpAffine(
+        np.asarray(values, np.float32), to_source[:2], size, flags=flags, borderMode=cv2.BORDER_CONSTANT,
+        borderValue=beyond,
+    )  # fmt: skip
+    return np.asarray(seen, np.float32)
+
+
+def _paste_logits(logits: Map, window: Window, shape: tuple[int, ...]) -> Map:
+    """``(H, W)``: a window's logits in a frame, very low beyond it."""
+    full = np.full(shape[:2], -8.0 * _MOST, np.float32)
+    region = cv2.resize(logits, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
+    rows, columns = (
+        slice(max(first, 0), max(min(first + window.side, size), 0))
+        for first, size in ((window.top, shape[0]), (window.left, shape[1]))
+    )
+    part = full[rows, columns]
+    part[:] = region[rows.start - window.top :, columns.start - window.left :][
+        : part.shape[0], : part.shape[1]
+    ]
+    return full
+
+
+def _probability(logits: Map) -> Map:
+    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -60, 60))), np.float32)

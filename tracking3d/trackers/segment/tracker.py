@@ -1,0 +1,105 @@
+"""Mask tracker ``segment``: the network of the package, flow that carries the mask, colours that remember."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from tracking3d.errors import InputError, PluginError
+from tracking3d.frames import Frame, Image, MaskEstimate, Prompt
+from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.cues import Cues
+from tracking3d.trackers.first_mask import mask_with_network
+from tracking3d.trackers.opencv_build import why_no_contrib
+from tracking3d.trackers.protocol import Options
+from tracking3d.trackers.segment.cue import NetworkCue
+from tracking3d.trackers.segment.network import ObjectNetwork
+from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
+
+_CUES = Cues(network=2.0, global_colours=0.5, local_colours=0.5, motion=1.0, background=0.5)
+_FIRST_MARGINS = (0.125, 0.2, 0.3)
+"""Free space around the box in the crops of the first frame, in which time does not matter."""
+
+
+class SegmentTracker:
+    """Mask tracker ``segment``.
+
+    In every frame the network sees a crop twice: with the last mask, carried by flow, and colours and motion of the
+    object; and with nothing but a box around it. Its log-odds join those of the tracker ``flow``.
+    """
+
+    class Options(Options):
+        """Options of ``segment``."""
+
+        segmentation_size: int = Field(
+            224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
+        )
+        network: float = Field(_CUES.network, ge=0, le=100, description="Weight of the network's log-odds.")
+        colours: float = Field(
+            _CUES.global_colours,
+            ge=0,
+            le=100,
+            description="Weight of the object's and background's colours, of the whole object and nearby.",
+        )
+        motion: float = Field(
+            _CUES.motion, ge=0, le=100, description="Weight of motion consistent with the object."
+        )
+        background: float = Field(
+            _CUES.background, ge=0, le=100, description="Weight of differences from the learnt background."
+        )
+        threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
+
+    def __init__(self, options: SegmentTracker.Options) -> None:
+        self._options = options
+        self._network = ObjectNetwork(options.threads)
+        self._segmentation: ColourSegmentation | None = None
+        self._cue: NetworkCue
+
+    @classmethod
+    def from_options(cls, options: BaseModel) -> Self:
+        """Build the tracker from its validated options."""
+        if not isinstance(options, SegmentTracker.Options):
+            raise PluginError("The tracker segment was given the options of another tracker.")
+        return cls(options)
+
+    @classmethod
+    def why_unavailable(cls) -> str:
+        """What the OpenCV in use lacks for this tracker; empty if it lacks nothing."""
+        return why_no_contrib(SMOOTHER)
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        """Start from a box or a mask; the prompt's mask is the first estimate, else the box is segmented."""
+        if clip_box(prompt.box, frame.image.shape) is None:
+            raise InputError(
+                f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
+            )
+        options = self._options
+        cues = Cues(
+            network=options.network, global_colours=options.colours, local_colours=options.colours,
+            motion=options.motion, background=options.background,
+        )  # fmt: skip
+        mask = prompt.mask if prompt.mask is not None else self._first_mask(frame.image, prompt)
+        self._cue = NetworkCue(self._network, prompt.box)
+        self._segmentation = ColourSegmentation(
+            frame.image, prompt.box, mask, options.segmentation_size, cues, self._cue
+        )
+        return self._segmentation.estimate
+
+    def step(self, frame: Frame) -> MaskEstimate:
+        """Estimate the mask in the next frame."""
+        if self._segmentation is None:
+            raise PluginError("The tracker segment must be started with init before it tracks a frame.")
+        return self._segmentation.step(frame.image)
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Continue from ``mask`` ``(H, W)`` in ``frame``."""
+        if (box := box_of(mask)) is not None and self._segmentation is not None:
+            self._segmentation.correct(frame.image, mask)
+            self._cue.correct(box)
+
+    def _first_mask(self, image: Image, prompt: Prompt) -> NDArray[np.bool_]:
+        likely = self._network.segment_box(image, prompt.box, _FIRST_MARGINS)
+        return mask_with_network(image, prompt.box, likely) > 0.5
