@@ -48,9 +48,9 @@ class NetworkCue:
         if (moved := frame_box(carried, present.window)) is not None:
             remembered = _settle(self._extent, last)
             self._extent = BoxOffset.between(last, remembered).apply(moved)
-        boxes = [_grow(self._extent, share) for share in _GROWN]
-        by_mask, by_boxes = self._network.log_odds(image, carried, motion.cue, present.window, colours, boxes)
-        return (_BY_MASK * by_mask + (1 - _BY_MASK) * by_boxes).astype(np.float32)
+        prompt = _grow(self._extent, _GROWN)
+        by_mask, by_box = self._network.log_odds(image, carried, motion.cue, present.window, colours, prompt)
+        return (_BY_MASK * by_mask + (1 - _BY_MASK) * by_box).astype(np.float32)
 
     def correct(self, box: Box) -> None:
         """Take the box ``(x, y, w, h)`` of a better mask as the object's extent."""

@@ -77,7 +77,7 @@ class ObjectNetwork:
         motion: Map,
         window: Window,
         colours: GlobalColours,
-        boxes: Sequence[Box],
+        box: Box,
     ) -> tuple[Map, Map]:
         """The object in a crop by its last mask, and by a box.
 
