@@ -46,11 +46,19 @@ def test_what_is_suggested_exists():
 
 
 @pytest.mark.usefixtures("script")
-@pytest.mark.parametrize("name", ["sam2", "SAM2", "sam2.1_hiera_tiny"])
-def test_sam_2_is_answered_with_the_plugin_and_with_masks(refused, clip, name):
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("mobilesam", "MobileSAM is the plug-in tracking3d-sam (--tracker sam), or "),
+        ("MobileSAM", "MobileSAM is the plug-in tracking3d-sam (--tracker sam), or "),
+        ("sam2.1_hiera_tiny", "SAM 2 and EdgeTAM are the plug-in tracking3d-sam2 (--tracker sam2), "),
+        ("EdgeTAM", "SAM 2 and EdgeTAM are the plug-in tracking3d-sam2 (--tracker sam2), "),
+    ],
+)
+def test_segment_anything_is_answered_with_the_plugin_and_with_masks(refused, clip, name, advice):
     line = refused("run", clip, *BOX, "--tracker", name, "--out", "out", "--quiet")
     assert line.startswith(f"error: There is no mask tracker '{name}' (installed: csrt, ")
-    assert "; MobileSAM is the plug-in tracking3d-sam (--tracker sam), or " in line
+    assert f"; {advice}" in line
     assert line.endswith("masks of other programs are read with --masks.")
 
 

@@ -48,8 +48,10 @@ class TrackerCandidate:
 _SAM = {"segmenter": "mobile-sam", "encoder": "mobile-sam-encoder", "decoder": "mobile-sam-decoder"}
 _U2 = {"segmenter": "u2netp", "model": "u2netp"}
 _NANO = {"box": "nano", "nano_backbone": "nanotrack-backbone", "nano_head": "nanotrack-head"}
+_NANO3 = {"box": "nano", "nano_backbone": "nanotrack3-backbone", "nano_head": "nanotrack3-head"}
 _SAM_FILES, _U2_FILES = ("mobile-sam-encoder", "mobile-sam-decoder"), ("u2netp",)
 _NANO_FILES = ("nanotrack-backbone", "nanotrack-head")
+_NANO3_FILES = ("nanotrack3-backbone", "nanotrack3-head")
 
 CANDIDATES = (
     TrackerCandidate("onnx", "MobileSAM in NanoTrack's box", 0.940, 1.57, _SAM_FILES + _NANO_FILES, _SAM | _NANO),
@@ -58,6 +60,10 @@ CANDIDATES = (
     TrackerCandidate(
         "onnx", "MobileSAM in NanoTrack's box, every 5th frame", 0.912, 0.36, _SAM_FILES + _NANO_FILES,
         _SAM | _NANO | {"every": 5},
+    ),
+    TrackerCandidate(
+        "onnx", "U2Netp in NanoTrack 3's box, every 5th frame", 0.904, 0.24, _U2_FILES + _NANO3_FILES,
+        _U2 | _NANO3 | {"every": 5},
     ),
     TrackerCandidate(
         "onnx", "U2Netp in NanoTrack's box, every 5th frame", 0.894, 0.25, _U2_FILES + _NANO_FILES,

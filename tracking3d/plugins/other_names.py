@@ -10,15 +10,18 @@ _SAM = (
     "MobileSAM is the plug-in tracking3d-sam (--tracker sam), or --tracker onnx with tracker.segmenter=mobile-sam, "
     "and masks of other programs are read with --masks"
 )
+_SAM2 = (
+    "SAM 2 and EdgeTAM are the plug-in tracking3d-sam2 (--tracker sam2), which needs their package and weights, "
+    "and masks of other programs are read with --masks"
+)
 _MASKS = "masks of other programs are read with --masks"
 _U2NET = "that network runs in --tracker onnx with tracker.segmenter=u2netp"
 _NETWORK = "that network runs in --features onnx with features.model=FILE.onnx"
 
 _ADVICE: dict[str, dict[str, str]] = {
     TRACKERS: {
-        **dict.fromkeys(
-            ("sam", "sam2", "sam3", "segmentanything", "mobilesam", "efficientsam", "fastsam"), _SAM
-        ),
+        **dict.fromkeys(("sam", "segmentanything", "mobilesam", "efficientsam", "fastsam"), _SAM),
+        **dict.fromkeys(("sam2", "sam3", "edgetam"), _SAM2),
         **dict.fromkeys(("xmem", "cutie", "deva", "stm", "aot", "deaot", "stcn", "mask", "masks"), _MASKS),
         **dict.fromkeys(("u2net", "u2netp", "rembg"), _U2NET),
         **{name: f"it is the plug-in tracking3d-{name}" for name in ("d3s", "kcf", "nanotrack", "ostrack")},
