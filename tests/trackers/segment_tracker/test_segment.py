@@ -81,7 +81,7 @@ def test_the_network_segments_a_box_of_a_still_image_and_nothing_beyond_its_crop
 
 def test_a_box_at_the_border_of_the_frame_is_segmented():
     clip = moving_disc((160, 240), 1)
-    x, _, width, _ = clip.box
+    x, y, width, height = clip.box
     image = np.ascontiguousarray(clip.frames[0].image[:, round(x + width / 2) :])
     truth = clip.mask[:, round(x + width / 2) :]
     likely = ObjectNetwork().segment_box(image, (0.0, y, width / 2, height))
