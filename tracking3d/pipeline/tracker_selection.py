@@ -55,6 +55,9 @@ _NANO3_FILES = ("nanotrack3-backbone", "nanotrack3-head")
 
 CANDIDATES = (
     TrackerCandidate("onnx", "MobileSAM in NanoTrack's box", 0.940, 1.57, _SAM_FILES + _NANO_FILES, _SAM | _NANO),
+    TrackerCandidate(
+        "onnx", "U2Netp in NanoTrack 3's box", 0.930, 0.94, _U2_FILES + _NANO3_FILES, _U2 | _NANO3
+    ),
     TrackerCandidate("onnx", "MobileSAM in CSR-DCF's box", 0.919, 1.60, _SAM_FILES, _SAM),
     TrackerCandidate("onnx", "U2Netp in NanoTrack's box", 0.918, 0.97, _U2_FILES + _NANO_FILES, _U2 | _NANO),
     TrackerCandidate(

@@ -108,7 +108,11 @@ class FlowTracker:
                 f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
             )
         options = self._options
-        weights = {one.name: getattr(options, one.name) for one in fields(Cues) if one.name != "witness"}
+        weights = {
+            one.name: getattr(options, one.name)
+            for one in fields(Cues)
+            if one.name not in ("witness", "network")
+        }
         cues = Cues(**weights, witness=options.witness_weight)
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, prompt.mask, size=options.segmentation_size, cues=cues
