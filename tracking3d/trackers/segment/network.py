@@ -38,14 +38,13 @@ class ObjectNetwork:
 
     Args:
         threads: CPU threads.
-        file: An ONNX file with the same inputs and outputs, in place of the package's.
     """
 
-    def __init__(self, threads: int = 1, file: Path | None = None) -> None:
+    def __init__(self, threads: int = 1) -> None:
         with resources.as_file(
             resources.files("tracking3d.trackers") / "weights" / "segmentation.onnx"
         ) as own:
-            self._network = Network(file or Path(own), threads)
+            self._network = Network(Path(own), threads)
 
     def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> Map:
         """The object in a box, by nothing but one image.
