@@ -8,9 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from tracking3d.cli.summary import print_summary
+from tracking3d.cli.summary import advise_networks, print_summary
 from tracking3d.estimation.estimate import MaskSource, lost_estimate
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.networks.catalogue import recommended_networks
 from tracking3d.results.contact_sheet import CROPS, TILE
 from tracking3d.results.notes import describe_camera_and_model, notes_of_run, notes_of_times, unseen_share
 from tracking3d.results.records import FrameRecord
@@ -83,6 +84,22 @@ def test_the_sheet_has_a_line_for_the_time_and_none_for_no_note(summary):
     assert "note" not in dict(rows)
     band = sheet[tiles * TILE :].astype(int)
     assert (np.abs(band - band[-1, -1]) > 60).any()  # something is written there
+
+
+@pytest.mark.parametrize(
+    ("tracker", "advised"), [("csrt", True), ("flow", True), ("onnx", False), ("", False)]
+)
+def test_a_run_without_networks_says_what_they_would_bring(tmp_path, monkeypatch, tracker, advised):
+    monkeypatch.setenv("TRACKING3D_CACHE", str(tmp_path))
+    assert advise_networks(tracker).startswith("`tracking3d models get recommended` (7 MB)") is advised
+
+
+def test_nothing_is_advised_if_the_networks_are_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("TRACKING3D_CACHE", str(tmp_path))
+    (tmp_path / "models").mkdir()
+    for network in recommended_networks():
+        (tmp_path / "models" / network.file).write_bytes(b"")
+    assert advise_networks("csrt") == ""
 
 
 def test_an_assumed_lens_is_noted(summary, turning_sphere):

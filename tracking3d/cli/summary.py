@@ -53,7 +53,7 @@ def print_summary(folder: Path) -> None:
         table.add_row(f"  {stage}", format_value(getattr(stages, stage)))
     if shape := run.get("shape"):
         table.add_row("shape", escape(str(shape)))
-    if advice := _advise_networks(reader.config["tracker"]["name"]):
+    if advice := advise_networks(reader.config.get("tracker", {}).get("name", "")):
         table.add_row("better masks", escape(advice))
     for note in run["notes"]:
         table.add_row("note", f"[yellow]{escape(note)}[/]")
@@ -63,7 +63,7 @@ def print_summary(folder: Path) -> None:
     print_table(table)
 
 
-def _advise_networks(tracker: str) -> str:
+def advise_networks(tracker: str) -> str:
     """What the recommended networks would bring to a run without networks; empty if they are there, or not needed."""
     from tracking3d.networks.catalogue import recommended_networks
     from tracking3d.networks.store import State, state_of
