@@ -34,7 +34,7 @@ class Cues:
         motion: Whether the pixel moves with the object or with the background.
         background: Whether the pixel has changed against what was seen there before.
         novelty: For the object, within the outline, where nothing else is known: it may be a new side.
-        witness: Distance beyond the box tracker's box.
+        box: Distance beyond the box tracker's box.
         network: Log-odds of a segmentation network, if there is one.
         smoother: Whether the edge-aware smoother follows.
     """
@@ -47,7 +47,7 @@ class Cues:
     motion: float = 2.0
     background: float = 1.0
     novelty: float = 2.0
-    witness: float = 1.0
+    box: float = 1.0
     network: float = 0.0
     smoother: bool = True
 

@@ -77,7 +77,7 @@ class FlowTracker:
             "none", description="Box tracker that checks the mask and recovers it if it is lost."
         )
         witness_weight: float = Field(
-            _CUES.witness, ge=0, le=100, description="Weight of the distance outside the box of `witness`."
+            _CUES.box, ge=0, le=100, description="Weight of the distance outside the box of `witness`."
         )
 
     def __init__(self, options: FlowTracker.Options) -> None:
@@ -111,9 +111,9 @@ class FlowTracker:
         weights = {
             one.name: getattr(options, one.name)
             for one in fields(Cues)
-            if one.name not in ("witness", "network")
+            if one.name in type(options).model_fields
         }
-        cues = Cues(**weights, witness=options.witness_weight)
+        cues = Cues(**weights, box=options.witness_weight)
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, prompt.mask, size=options.segmentation_size, cues=cues
         )

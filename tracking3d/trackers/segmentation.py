@@ -161,7 +161,7 @@ class ColourSegmentation:
             said = self._network.log_odds(image, present, motion, self._colours, box)
             evidence += self._cues.network * said
         if witness is not None:
-            evidence -= self._cues.witness * distance_beyond(witness, present.window)
+            evidence -= self._cues.box * distance_beyond(witness, present.window)
         mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
 
         at_border = touches_border(moved, present.in_frame)

@@ -1,7 +1,7 @@
 """The video predictor of the package ``sam2``, one frame at a time.
 
-The predictor expects a folder with all frames. It only ever looks at the frame that it is asked about and at its own
-memory, so that it can be told of one more frame in every step; what it remembers of old frames is dropped.
+The predictor expects a folder with all frames. It only looks at the frame that it segments and at its own memory,
+so that it can be given one more frame in every step; what it remembers of old frames is dropped.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class StreamingPredictor:
         self._propagate(index)
 
     def _propagate(self, index: int) -> tuple[Any, ...]:
-        """Run the predictor over one frame; what it has been told of it enters its memory."""
+        """Run the predictor over one frame; prompts in it enter its memory."""
         found = list(self._predictor.propagate_in_video(self._state, index, 0))
         return tuple(found[0])
 
