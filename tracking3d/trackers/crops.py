@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.frames import Box
+from tracking3d.errors import InputError
+from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Window
 
 
@@ -63,6 +64,18 @@ def clip_box(box: Box, shape: tuple[int, ...]) -> Box | None:
     x0, y0 = max(box[0], 0.0), max(box[1], 0.0)
     x1, y1 = min(box[0] + box[2], float(shape[1])), min(box[1] + box[3], float(shape[0]))
     return (x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None
+
+
+def check_box_in_frame(box: Box, frame: Frame) -> None:
+    """Make sure that a first box shows something.
+
+    Raises:
+        InputError: Under a pixel of the box is inside the frame.
+    """
+    if clip_box(box, frame.image.shape) is None:
+        raise InputError(
+            f"The box {box} lies outside {frame.name or 'the first frame'}; give a box inside it."
+        )
 
 
 def outside(box: Box, shape: tuple[int, ...], slack: float = 0.0) -> NDArray[np.bool_]:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from tracking3d.errors import InputError, PluginError
+from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.box_trackers import OpenCvBoxes
-from tracking3d.trackers.crops import box_iou, box_of, clip_box
+from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
 from tracking3d.trackers.csrt import STRAYED, BoxTracker, CsrtTracker
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.opencv_build import why_no_contrib
@@ -103,10 +103,7 @@ class FlowTracker:
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start from a box or a mask; the prompt's mask is the first estimate, else the box's segmentation."""
-        if clip_box(prompt.box, frame.image.shape) is None:
-            raise InputError(
-                f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
-            )
+        check_box_in_frame(prompt.box, frame)
         options = self._options
         weights = {
             one.name: getattr(options, one.name)

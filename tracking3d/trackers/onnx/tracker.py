@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from tracking3d.errors import InputError, PluginError
+from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
-from tracking3d.trackers.crops import box_iou, box_of, clip_box
+from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
 from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
 from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
 from tracking3d.trackers.onnx.proposals import PointSegmenter
@@ -59,10 +59,7 @@ class OnnxTracker:
             InputError: If the box lies outside the frame.
         """
         image, box = frame.image, prompt.box
-        if clip_box(box, image.shape) is None:
-            raise InputError(
-                f"The box {box} lies outside {frame.name or 'the first frame'}; give a box inside it."
-            )
+        check_box_in_frame(box, frame)
         estimate = self._first_answer(image, prompt)
         mask = np.zeros(frame.size, np.float32) if estimate.mask is None else estimate.mask
         if prompt.points is not None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from tracking3d.errors import InputError, PluginError
+from tracking3d.errors import PluginError
 from tracking3d.frames import Frame, Image, MaskEstimate, Prompt
-from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.crops import box_of, check_box_in_frame
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.trackers.opencv_build import why_no_contrib
@@ -72,10 +72,7 @@ class SegmentTracker:
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start from a box or a mask; the prompt's mask is the first estimate, else the box is segmented."""
-        if clip_box(prompt.box, frame.image.shape) is None:
-            raise InputError(
-                f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
-            )
+        check_box_in_frame(prompt.box, frame)
         options = self._options
         cues = Cues(
             network=options.network, global_colours=options.colours, local_colours=options.colours,
