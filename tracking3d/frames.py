@@ -5,7 +5,7 @@ Images are ``(H, W, 3)`` uint8 RGB arrays; pixel (0, 0) is the *centre* of the t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class Frame:
         time: Seconds since the start of the video, where known.
         name: What messages call it: a file name, or ``"frame 12"``.
         decoding: Seconds that reading it took, where measured; one object's share, where several are tracked.
+        occluder: ``(H, W)`` bool, what is known to be in front of the tracked object; None where nothing is known.
     """
 
     index: int
@@ -37,6 +38,7 @@ class Frame:
     time: float | None = None
     name: str = ""
     decoding: float = 0.0
+    occluder: NDArray[np.bool_] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,11 +83,14 @@ class MaskEstimate:
         mask: ``(H, W)`` float32 in [0, 1], full resolution; None where the tracker has no answer for this frame.
         score: The tracker's own confidence in [0, 1].
         reason: Why there is no mask, or why the score is low; one short clause.
+        occluder: ``(H, W)`` bool, what is in front of the object or beside it, such as a hand: neither object nor
+            background. None where the tracker cannot tell.
     """
 
     mask: NDArray[np.float32] | None
     score: float = 1.0
     reason: str = ""
+    occluder: NDArray[np.bool_] | None = None
 
     @property
     def binary(self) -> NDArray[np.bool_] | None:
@@ -97,6 +102,10 @@ class MaskEstimate:
         """The same; None where it is empty, too."""
         binary = self.binary
         return binary if binary is not None and binary.any() else None
+
+    def on(self, frame: Frame) -> Frame:
+        """The frame with what this estimate says is in front of the object."""
+        return frame if self.occluder is None else replace(frame, occluder=self.occluder)
 
 
 def pixels(size: tuple[int, int]) -> str:

@@ -84,6 +84,8 @@ class FrameEstimate:
         revised: Better estimates for earlier frames that this frame made possible; they replace those given before.
         camera: The camera of the full frame that the pose refers to. If the focal length is not given, it changes as
             the solver learns more. None if the estimate does not say: the camera known from the first frame on.
+        occluder: ``(H, W)`` bool, what the mask tracker says is in front of the object; None if it cannot tell. The
+            mask takes in what it hides.
         points: Where the points are that `tracking3d.track` was asked to follow; None if it was asked for none.
     """
 
@@ -107,8 +109,14 @@ class FrameEstimate:
     revised: tuple[FrameEstimate, ...] = ()
     camera: Camera | None = None
     points: PointAnswers | None = None
+    occluder: NDArray[np.bool_] | None = None
     probability: NDArray[np.float32] | None = None
     diagnostics: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def visible_mask(self) -> NDArray[np.bool_]:
+        """``(H, W)`` bool, what is seen of the object: the mask without what is in front of it."""
+        return self.mask if self.occluder is None else self.mask & ~self.occluder
 
 
 @dataclass(frozen=True, eq=False)

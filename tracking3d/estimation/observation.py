@@ -34,6 +34,7 @@ class Observation:
         mask: ``(S, S)`` rough mask in [0, 1]; all zero if there is none.
         distance: ``(S, S)`` distance to the mask in NDC, zero inside it.
         has_mask: Whether the mask tracker gave a mask.
+        occluder: ``(S, S)`` in [0, 1], what is known to be in front of the object; None if nothing is known.
     """
 
     index: int
@@ -45,6 +46,7 @@ class Observation:
     mask: Tensor
     distance: Tensor
     has_mask: bool
+    occluder: Tensor | None = None
 
     @cached_property
     def half(self) -> Observation:
@@ -53,8 +55,9 @@ class Observation:
 
     @cached_property
     def outline_distance(self) -> Tensor:
-        """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`."""
-        return outline_distance(self.mask, self.valid)
+        """``(S, S)`` see `outline_distance`; beside what is in front, the mask's outline is not the object's."""
+        known = self.valid if self.occluder is None else self.valid * (self.occluder < 0.5)
+        return outline_distance(self.mask, known)
 
     @cached_property
     def target(self) -> PoseTarget:
@@ -127,8 +130,14 @@ def observe(
         soft = _resample(functional.pad(there[None], border), window.size)[0]
         distance = mask_distance(soft)
     K = torch.tensor(window.K(camera), dtype=torch.float32, device=device)
+    occluder = None
+    if frame.occluder is not None:
+        covered = torch.from_numpy(frame.occluder[rows, columns]).to(device).float()
+        occluder = _resample(functional.pad(covered[None], border), window.size)[0]
     known = mask is not None and bool(soft.any())
-    return Observation(frame.index, window, K, detail, features[0].float(), valid, soft, distance, known)
+    return Observation(
+        frame.index, window, K, detail, features[0].float(), valid, soft, distance, known, occluder
+    )
 
 
 def downsample(observation: Observation) -> Observation:
@@ -151,6 +160,7 @@ def downsample(observation: Observation) -> Observation:
         valid=pool(observation.valid).ge(0.75).float(),
         mask=pool(observation.mask),
         distance=pool(observation.distance),
+        occluder=None if observation.occluder is None else pool(observation.occluder),
     )
 
 
@@ -215,13 +225,14 @@ def mask_box(mask: NDArray[np.bool_]) -> Box:
 
 
 def outline_distance(mask: Tensor, valid: Tensor) -> Tensor:
-    """``(S, S)`` signed distance in pixels to the mask's outline, negative inside, zero beyond the frame's border.
+    """``(S, S)`` signed distance in pixels to the mask's outline, negative inside, zero where nothing is known.
 
-    A mask that the border cuts off goes on beyond it: the cut is no outline of the object.
+    A mask that the frame's border cuts off goes on beyond it, and one that an occluder cuts off behind that: the cut is
+    no outline of the object.
 
     Args:
         mask: ``(S, S)`` in [0, 1].
-        valid: ``(S, S)`` 1 inside the frame, 0 beyond its border.
+        valid: ``(S, S)`` 1 where the mask is known, 0 beyond the frame's border and behind occluders.
     """
     inside = valid > 0.5
     if bool(inside.all()) or not bool(inside.any()):

@@ -40,8 +40,9 @@ def corrects(estimate: FrameEstimate) -> bool:
         return False
     if estimate.initial_mask is None:
         return estimate.hypothesis == RELOCALIZED
-    both = int(np.count_nonzero(estimate.mask & estimate.initial_mask))
-    either = int(np.count_nonzero(estimate.mask | estimate.initial_mask))
+    visible = estimate.visible_mask
+    both = int(np.count_nonzero(visible & estimate.initial_mask))
+    either = int(np.count_nonzero(visible | estimate.initial_mask))
     if estimate.hypothesis == RELOCALIZED and both <= ELSEWHERE * either:
         return True
     least, most = WORTH_CORRECTING

@@ -61,9 +61,11 @@ class UndistortingSolver(Generic[State]):
         return replace(frame, image=self._lens.undistort(frame.image))
 
     def _mask(self, mask: MaskEstimate) -> MaskEstimate:
+        occluder = None if mask.occluder is None else self._lens.mask_to_pinhole(mask.occluder)
         if mask.mask is None:
-            return mask
-        return replace(mask, mask=self._lens.mask_to_pinhole(mask.mask.astype(np.float32)))
+            return replace(mask, occluder=occluder)
+        pinhole = self._lens.mask_to_pinhole(mask.mask.astype(np.float32))
+        return replace(mask, mask=pinhole, occluder=occluder)
 
     def _answer(self, estimate: FrameEstimate, mask: MaskEstimate | None = None) -> FrameEstimate:
         """An estimate for the original images; the inputs come back unchanged."""

@@ -118,11 +118,12 @@ class FinalRefinement:
     def _collect(self, record: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
         """Keep what the final poses, surface and texture can be taken from; the record as it is."""
         most = self._session.config.object.texture_views
+        visible = self._estimates.visible(frame.index, mask)
         if self._precomputed is None:
-            self._last.collect(frame, mask)
+            self._last.collect(frame, visible)
         if most and record.status is Status.TRACKED:
             camera = record.through(self._session.camera)
-            image, seen = camera.undistort(frame.image), camera.mask_to_pinhole(mask)
+            image, seen = camera.undistort(frame.image), camera.mask_to_pinhole(visible)
             view = texture_view(frame.index, image, seen, camera, record.T_cam_obj)
             self._views = self._views if view is None else keep_best_views(self._views, view, most)
         return record

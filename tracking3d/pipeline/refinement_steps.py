@@ -118,11 +118,11 @@ class RefinementSteps:
 
         Args:
             frame: The frame.
-            mask: ``(H, W)`` of its refined estimate, if it is at hand.
+            mask: ``(H, W)`` what its refined estimate shows of the object, if it is at hand.
         """
         record = self._estimates.estimate(frame.index)
         if record.refined and self.look.wants(frame.index):
-            self.look.see(record, frame.image, self._estimates.mask(record) if mask is None else mask)
+            self.look.see(record, frame.image, self._visible(record) if mask is None else mask)
 
     def adjust_all(self) -> Camera:
         """All frames were collected: adjust poses, surface and lens together; the final camera."""
@@ -134,7 +134,7 @@ class RefinementSteps:
         record = self._estimates.estimate(frame.index)
         if not record.refined:
             return record
-        T_cam_obj, support = self.look.pose(record, frame.image, self._estimates.mask(record))
+        T_cam_obj, support = self.look.pose(record, frame.image, self._visible(record))
         judged = () if support is None else assess_estimate(record, support)
         return adjusted_record(record, T_cam_obj, *judged)
 
@@ -181,6 +181,7 @@ class RefinementSteps:
         """A frame as `Hindsight` takes it: through a camera without lens distortion."""
         camera, record = self.look.camera, self._estimates.estimate(frame.index)
         mask, initial = self._estimates.mask(record), self._estimates.initial_mask(frame.index)
+        occluder = self._estimates.occluder(frame.index)
         return Answered(
             record.index,
             camera.undistort(frame.image),
@@ -188,7 +189,11 @@ class RefinementSteps:
             camera.mask_to_pinhole(mask),
             record.T_cam_obj if _has_pose(record) else np.full((4, 4), np.nan),
             record.confidence,
+            None if occluder is None else camera.mask_to_pinhole(occluder),
         )
+
+    def _visible(self, record: FrameRecord) -> NDArray[np.bool_]:
+        return self._estimates.visible(record.index, self._estimates.mask(record))
 
     def _make_decision(self, found: tuple[int, SegmentedMask | None]) -> Decision:
         index, decided = found

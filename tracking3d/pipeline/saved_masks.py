@@ -35,7 +35,8 @@ class SavedMasks:
     def estimate(self, index: int, mask: NDArray[np.bool_] | None) -> MaskEstimate:
         """The initial mask ``(H, W)`` of a frame with its score and reason."""
         score, reason = self.initial.get(index, (1.0, ""))
-        return MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
+        occluder = None if mask is None else self.estimates.occluder(index)
+        return MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason, occluder)
 
     def with_masks(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, MaskEstimate]]:
         """Frames with their initial masks."""

@@ -139,6 +139,7 @@ class Session(SessionRefinement):
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
         self._state, estimate = solver.init(frame, mask)
+        estimate = replace(estimate, occluder=mask.occluder)
         if self.config.object.trust_masks:
             estimate = with_initial_mask(estimate)
         self._solver, self.initial_mask = solver, mask
@@ -252,7 +253,7 @@ class Session(SessionRefinement):
             if prompt is not None and mask.found is not None and isinstance(solver, GuidedSolver):
                 self._state = solver.trust_mask(self._state, shown, mask.found)
             self._state, estimate = solver.step(self._state, shown, mask)
-            estimate = self._presented.index(estimate)
+            estimate = replace(self._presented.index(estimate), occluder=mask.occluder)
             if self.config.object.trust_masks:
                 estimate = with_initial_mask(estimate)
         except PluginFailure as error:
@@ -276,7 +277,7 @@ class Session(SessionRefinement):
         corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
         if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
             self.corrected = True
-            self._tracker.correct(frame, estimate.mask)
+            self._tracker.correct(frame, estimate.visible_mask)
 
     def _solver_for(self, frame: Frame) -> Solver[Any]:
         """The solver, restarted backwards if this frame is the first one before the prompt frame."""

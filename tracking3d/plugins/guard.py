@@ -135,9 +135,9 @@ class GuardedTracker:
         if fault := mask_fault(answer, frame.size):
             raise PluginFailure(self._label, fault)
         mask: NDArray[np.float32] | None = answer.mask
-        if mask is None or mask.dtype == np.float32:
-            return MaskEstimate(mask, float(answer.score), str(answer.reason))
-        return MaskEstimate(mask.astype(np.float32), float(answer.score), str(answer.reason))
+        if mask is not None and mask.dtype != np.float32:
+            mask = mask.astype(np.float32)
+        return MaskEstimate(mask, float(answer.score), str(answer.reason), answer.occluder)
 
 
 class GuardedEncoder:
@@ -195,6 +195,11 @@ def mask_fault(answer: Any, size: tuple[int, int]) -> str:
         return f"it returned {_kind(answer)} instead of a MaskEstimate"
     if not isinstance(answer.score, int | float | np.number) or not 0 <= answer.score <= 1:
         return f"its score is {answer.score!r} instead of a number from 0 to 1"
+    occluder: Any = answer.occluder
+    if occluder is not None and not (isinstance(occluder, np.ndarray) and occluder.dtype == np.bool_):
+        return f"its occluder is {_kind(occluder)} instead of an array of bool"
+    if occluder is not None and occluder.shape != size:
+        return f"its occluder has shape {occluder.shape}, but the frame has ({size[0]}, {size[1]})"
     mask: Any = answer.mask
     if mask is None:
         return ""

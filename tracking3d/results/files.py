@@ -139,13 +139,18 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
 
 def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
     """A mask from the bytes of such a file; None if they are no image, or too large a one."""
+    image = decode_grey(data)
+    return None if image is None else image >= 128
+
+
+def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
+    """``(H, W)`` from the bytes of an image file; None if they are no image, or too large a one."""
     import cv2
 
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:  # more pixels than OpenCV decodes
         return None
-    return None if image is None else image >= 128
 
 
 def first_problem(*steps: Callable[[], None]) -> Exception | None:

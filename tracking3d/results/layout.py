@@ -5,7 +5,8 @@
     run.json            configuration as used, camera, versions, seed, counts, timings, state
     frames.jsonl        one line a frame, flushed; a better estimate for an earlier frame is a further line
     masks/              the estimates, 0/255 PNG at full resolution, named by frame index
-    initial_masks/      what the mask tracker gave
+    visible_masks/      the same without what is in front of the object, if the mask tracker can tell
+    initial_masks/      what the mask tracker gave: 255 the object, 64 what is in front of it
     probabilities/      object probabilities of the estimated masks, if requested
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
@@ -36,6 +37,7 @@ FORMAT_VERSION = 2
 RUN = "run.json"
 FRAMES = "frames.jsonl"
 MASKS = "masks"
+VISIBLE_MASKS = "visible_masks"
 INITIAL_MASKS = "initial_masks"
 PROBABILITIES = "probabilities"
 CAUSAL = "causal"
@@ -180,6 +182,7 @@ def run_files(folder: Path) -> list[Path]:
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,
+        folder / VISIBLE_MASKS,
         folder / INITIAL_MASKS,
         folder / PROBABILITIES,
         folder / REFINING / PROBABILITIES,
@@ -195,7 +198,8 @@ def run_files(folder: Path) -> list[Path]:
 
 def run_folders(folder: Path) -> list[Path]:
     """The folders within a run folder, whether they are there or not; outer ones first."""
-    inner = (CAUSAL, ONLINE, REFINING, STATE, CORRECTING, PARTS, MASKS, INITIAL_MASKS, PROBABILITIES, PROMPTS)
+    masks = (MASKS, VISIBLE_MASKS, INITIAL_MASKS, PROBABILITIES, PROMPTS)
+    inner = (CAUSAL, ONLINE, REFINING, STATE, CORRECTING, PARTS, *masks)
     within = ((CAUSAL, MASKS), (REFINING, MASKS), (REFINING, PROBABILITIES), (STATE, MASKS))
     return [folder / name for name in inner] + [folder / outer / name for outer, name in within]
 

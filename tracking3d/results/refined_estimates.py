@@ -16,6 +16,7 @@ from tracking3d.results.files import decode_mask, mask_file, read_mask, write_ma
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import measure
 
 
@@ -66,6 +67,15 @@ class RefinedEstimates:
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
         """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""
         return read_mask(layout.initial_mask_path(self._folder, index))
+
+    def occluder(self, index: int) -> NDArray[np.bool_] | None:
+        """What the mask tracker said is in front of the object in frame ``index``, ``(H, W)`` bool, or None."""
+        return read_occluder(self._folder, index)
+
+    def visible(self, index: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """What is seen of the object, ``(H, W)``: its mask in frame ``index`` without what is in front of it."""
+        occluder = self.occluder(index)
+        return mask if occluder is None else mask & ~occluder
 
     def put(self, record: FrameRecord) -> None:
         """Replace a refined estimate, see `put_right`; causal ones stand.

@@ -30,6 +30,7 @@ from tracking3d.results.files import (
     writing,
 )
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
+from tracking3d.results.initial_masks import write_initial_mask
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.overwrite import check_output_folder, clear_run_folder
@@ -38,6 +39,7 @@ from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.results.visible_masks import write_visible_masks
 from tracking3d.runtime.regular_work import RegularWork
 
 FinalState = Literal["finished", "interrupted", "failed"]
@@ -286,10 +288,8 @@ class RunWriter:
         self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
         self._description |= {key: earlier[key] for key in _STAYS & earlier.keys()}
-        self._description["resumed"] = [
-            *earlier.get("resumed", ()),
-            {"at": description.now(), "frames": len(known)},
-        ]
+        again = {"at": description.now(), "frames": len(known)}
+        self._description["resumed"] = [*earlier.get("resumed", ()), again]
         self._description["skipped"] = [{"index": one.index, "reason": one.reason} for one in so_far.skipped]
 
     def _record(
@@ -297,10 +297,10 @@ class RunWriter:
     ) -> FrameRecord:
         initial_path = layout.initial_mask_path(self.folder, estimate.index)
         initial = estimate.initial_mask
-        if initial is not None:
-            write_mask(initial_path, initial)
-        elif revision:
+        if revision and initial_path.is_file():  # a better estimate has the same initial mask
             initial = read_mask(initial_path)
+        elif initial is not None:
+            write_initial_mask(self.folder, estimate.index, initial, estimate.occluder)
         record = FrameRecord.of(estimate, name, initial, revision)
         write_mask(layout.mask_path(self.folder, estimate.index), estimate.mask)
         if self._probabilities:
@@ -330,6 +330,7 @@ class RunWriter:
             self._pictures.close,
             partial(self._give_up_refinement, state, error),
             partial(self._finish, model),
+            partial(write_visible_masks, self.folder),
         ]
         if model is not None:
             steps.insert(2, partial(export_mesh, self.folder, model))

@@ -38,19 +38,28 @@ class ColourModels:
     histograms: NDArray[np.float64]
 
     @classmethod
-    def of(cls, lab: NDArray[np.uint8], mask: NDArray[np.bool_], before: Self | None = None) -> Self | None:
+    def of(
+        cls,
+        lab: NDArray[np.uint8],
+        mask: NDArray[np.bool_],
+        before: Self | None = None,
+        occluder: NDArray[np.bool_] | None = None,
+    ) -> Self | None:
         """What is known after one more frame.
 
         Args:
             lab: ``(S, S, 3)`` crop in 8-bit Lab.
             mask: ``(S, S)`` the object in it.
             before: What was known before.
+            occluder: ``(S, S)`` what is in front of the object, and shows neither it nor its surroundings.
 
         Returns:
             The same as before where the crop does not show both sides.
         """
         distance = relative_distance(mask)
         inside, beside = distance > _INSIDE, (distance < -_BESIDE[0]) & (distance > -_BESIDE[1])
+        if occluder is not None:
+            inside, beside = inside & ~occluder, beside & ~occluder
         if not inside.any() or not beside.any():
             return before
         found = histograms(lab, inside, beside)

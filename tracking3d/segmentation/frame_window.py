@@ -18,7 +18,6 @@ from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 LARGEST = 320
 """Pixels of a window's side; a larger one is seen smaller."""
 _MARGIN = 0.2  # beside the masks, relative to their longer side
-
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
@@ -34,6 +33,7 @@ class Answered:
         answer: ``(H, W)`` the estimated mask.
         T_cam_obj: ``(4, 4)``; NaN if there is no pose that is trusted.
         confidence: The confidence of the pose, in [0, 1].
+        occluder: ``(H, W)`` what is in front of the object; None if nothing is known.
     """
 
     index: int
@@ -42,6 +42,7 @@ class Answered:
     answer: Mask
     T_cam_obj: NDArray[np.float64]
     confidence: float
+    occluder: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,7 @@ class FrameWindow:
         inverse_depth: Of the surface, carried on beyond the silhouette; 0 without a pose.
         confidence: The confidence of the pose, in [0, 1].
         valid: What lies in the frame.
+        occluder: What is in front of the object; None if nothing is known.
     """
 
     window: Window
@@ -71,6 +73,7 @@ class FrameWindow:
     inverse_depth: Plane
     confidence: float
     valid: Mask
+    occluder: Mask | None = None
 
     @classmethod
     def of(
@@ -96,7 +99,9 @@ class FrameWindow:
         )
         K, T_cam_obj = window.K(camera), frame.T_cam_obj
         drawn, inverse_depth = surface_in(K, T_cam_obj, vertices, faces, window.size)
-        image = crop_window(frame.image, window)
+        image, occluder = crop_window(frame.image, window), None
+        if frame.occluder is not None:
+            occluder = (crop_window(frame.occluder.astype(np.float32), window) > 0.5) & valid
         return cls(
             window,
             image,
@@ -108,6 +113,7 @@ class FrameWindow:
             inverse_depth,
             frame.confidence,
             valid,
+            occluder,
         )
 
 

@@ -1,4 +1,4 @@
-"""How far a pose may redraw an initial mask: a doubted one not at all."""
+"""How far a pose may redraw an initial mask: a doubted one not at all, one behind an occluder alone."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ _NO_WEIGHT, _FULL_WEIGHT = 0.5, 0.75
 """Confidence of a pose up to which it redraws nothing, and from which it has its say in full."""
 _INITIAL_LOG_ODDS = 2.0
 """Log-odds of the pixels of an initial mask, and less those beside it, where it is weighed against a doubted pose."""
+
+_MOST_BY_SHAPE, _AT_OUTLINE = 4.0, 0.02
+"""Log-odds by a shape alone, and distance from its outline at which they saturate, over the root of the area."""
 
 
 def pose_weight(confidence: float) -> float:
@@ -48,3 +51,12 @@ def blend_with_initial(
         return log_odds
     alone = np.where(initial, _INITIAL_LOG_ODDS, -_INITIAL_LOG_ODDS)
     return np.asarray(weight * log_odds + (1 - weight) * alone, np.float32)
+
+
+def shape_log_odds(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(S, S)`` log-odds of the object where the image cannot tell, because something is in front of it.
+
+    Args:
+        distance: ``(S, S)`` to the outline of its shape, over the root of the area, positive inside.
+    """
+    return np.asarray(_MOST_BY_SHAPE * np.tanh(distance / _AT_OUTLINE), np.float32)

@@ -23,7 +23,7 @@ from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Pl
 from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT, InitialMaskAgreement
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
-from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
+from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
 from tracking3d.segmentation.whole_video_features import PixelEvidence
@@ -106,7 +106,7 @@ class VideoSegmenter:
             self._consensus.see(scene)
             if self._agreement is not None:
                 self._agreement.see(scene)
-            self._colours = ColourModels.of(as_lab(scene.image), scene.answer, self._colours)
+            self._colours = ColourModels.of(as_lab(scene.image), scene.answer, self._colours, scene.occluder)
 
     def settle(self) -> None:
         """All frames were seen a first time."""
@@ -177,7 +177,10 @@ class VideoSegmenter:
             return frame.index, None
         scene, said = asked
         weight = (1 - initial_weight) * pose_weight(frame.confidence)
-        odds = blend_with_initial(said.log_odds(WEIGHTS), scene.initial, weight)
+        odds = said.log_odds(WEIGHTS)
+        if scene.occluder is not None and (behind := said.shape) is not None:
+            odds = np.where(scene.occluder, shape_log_odds(behind), odds)
+        odds = blend_with_initial(odds, scene.initial, weight)
         support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))

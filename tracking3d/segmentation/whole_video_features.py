@@ -86,6 +86,12 @@ class PixelEvidence:
         masks = [self.distances[name] for name in ("initial", "answer", "drawn") if name in self.distances]
         return np.asarray(np.max(masks, 0) > -_BESIDE)
 
+    @property
+    def shape(self) -> Plane | None:
+        """``(S, S)`` distance to the outline that surface and hull give the object; None if there is neither."""
+        shapes = [self.distances[name] for name in ("drawn", "wide hull") if name in self.distances]
+        return np.asarray(np.mean(shapes, 0), np.float32) if shapes else None
+
     def sources(self) -> Iterator[tuple[str, Plane]]:
         """Each by name, ``(S, S)``."""
         for plane, beliefs in self._terms():

@@ -95,7 +95,8 @@ def _check_estimate(answer: Any, frame: Frame, what: str) -> MaskEstimate:
 
 def _copy_estimate(answer: MaskEstimate) -> MaskEstimate:
     mask = None if answer.mask is None else answer.mask.copy()
-    return MaskEstimate(mask, answer.score, answer.reason)
+    occluder = None if answer.occluder is None else answer.occluder.copy()
+    return MaskEstimate(mask, answer.score, answer.reason, occluder)
 
 
 def _check_answers(build: Callable[[], MaskTracker], clip: Clip, with_mask: bool) -> None:

@@ -96,7 +96,7 @@ class OnlineSolver(MapExtension):
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        return self._first_state(frame, first_mask(frame, mask), self.camera)
+        return self._first_state(mask.on(frame), first_mask(frame, mask), self.camera)
 
     def _first_state(
         self, frame: Frame, binary: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
@@ -138,7 +138,7 @@ class OnlineSolver(MapExtension):
 
     def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
-        binary, image = mask.found, grey(frame.image)
+        frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
         state, estimate = self._track(state, frame, image, binary)
@@ -183,7 +183,7 @@ class OnlineSolver(MapExtension):
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[SolverState, FrameEstimate]:
         """Estimate a frame's pose again, with the final map."""
-        state = map_of_frame(state, frame.index)
+        state, frame = map_of_frame(state, frame.index), mask.on(frame)
         binary, image, object_map = mask.found, grey(frame.image), state.object_map
         T_cam_obj = state.extended.get(frame.index, T_cam_obj)
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
+from tracking3d.geometry.camera import Window
 from tracking3d.trackers.box_trackers import BoxOffset
 from tracking3d.trackers.colour_models import GlobalColours
+from tracking3d.trackers.crops import paste_mask
 from tracking3d.trackers.cues import FrameCrop
 from tracking3d.trackers.mask_motion import MaskMotion
 from tracking3d.trackers.segment.network import Map, ObjectNetwork, frame_box
@@ -31,6 +34,7 @@ class NetworkCue:
     def __init__(self, network: ObjectNetwork, box: Box) -> None:
         self._network = network
         self._extent = box
+        self._occluder: tuple[Map, Window] | None = None
 
     def log_odds(
         self, image: Image, present: FrameCrop, motion: MaskMotion, colours: GlobalColours, last: Box
@@ -49,8 +53,21 @@ class NetworkCue:
             remembered = _settle(self._extent, last)
             self._extent = BoxOffset.between(last, remembered).apply(moved)
         prompt = _grow(self._extent, _GROWN)
-        by_mask, by_box = self._network.log_odds(image, carried, motion.cue, present.window, colours, prompt)
+        by_mask, by_box, occluder = self._network.log_odds(
+            image, carried, motion.cue, present.window, colours, prompt
+        )
+        self._occluder = occluder, present.window
         return (_BY_MASK * by_mask + (1 - _BY_MASK) * by_box).astype(np.float32)
+
+    def take_occluder(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """``(H, W)``, what is in front of the object in the frame of ``shape`` that was asked about last.
+
+        None if no frame was asked about since the last call.
+        """
+        if self._occluder is None:
+            return None
+        (log_odds, window), self._occluder = self._occluder, None
+        return paste_mask(log_odds > 0, window, shape) > 0.5
 
     def correct(self, box: Box) -> None:
         """Take the box ``(x, y, w, h)`` of a better mask as the object's extent."""

@@ -46,8 +46,8 @@ class ObjectNetwork:
         ) as own:
             self._network = Network(Path(own), threads)
 
-    def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> Map:
-        """The object in a box, by nothing but one image.
+    def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> tuple[Map, Map]:
+        """The object in a box, and what is in front of it, by nothing but one image.
 
         Every crop is seen twice, the second time mirrored.
 
@@ -57,17 +57,17 @@ class ObjectNetwork:
             margins: Free space around the box in each crop, in its longer side.
 
         Returns:
-            ``(H, W)`` in [0, 1]: the probability of the object, 0 beyond the crops.
+            ``(H, W)`` in [0, 1] each: the probability of the object and of an occluder, 0 beyond the crops.
         """
         visible = clip_box(box, image.shape) or box
         windows = [Window.around(visible, margin, SIZE) for margin in margins]
         crops = np.stack([_box_channels(FrameCrop.of(image, window), box) for window in windows])
-        logits = self._run(np.concatenate([crops, crops[..., ::-1]]))[:, 0]
-        both = (logits[: len(windows)] + logits[len(windows) :, :, ::-1]) / 2
-        full = np.zeros(image.shape[:2], np.float32)
-        for window, one in zip(windows, both, strict=True):
-            full += _paste_logits(one, window, image.shape) / len(windows)
-        return _probability(full)
+        logits = self._run(np.concatenate([crops, crops[..., ::-1]]))
+        mean = (logits[: len(windows)] + logits[len(windows) :, ..., ::-1]) / 2
+        full = np.zeros((2, *image.shape[:2]), np.float32)
+        for window, maps in zip(windows, mean, strict=True):
+            full += np.stack([_paste_logits(one, window, image.shape) for one in maps]) / len(windows)
+        return _probability(full[0]), _probability(full[1])
 
     def log_odds(
         self,
@@ -77,8 +77,8 @@ class ObjectNetwork:
         window: Window,
         colours: GlobalColours,
         box: Box,
-    ) -> tuple[Map, Map]:
-        """The object in a crop by its last mask, and by a box.
+    ) -> tuple[Map, Map, Map]:
+        """The object in a crop by its last mask, and by a box; and what is in front of it.
 
         Args:
             image: ``(H, W, 3)`` RGB, the present frame.
@@ -89,12 +89,13 @@ class ObjectNetwork:
             box: ``(x, y, w, h)`` in the frame, the other prompt.
 
         Returns:
-            ``(S, S)`` log-odds within [-4, 4] by the mask, with colours and motion, and by the box.
+            ``(S, S)`` log-odds within [-4, 4]: the object by the mask, with colours and motion, and by the box; an
+            occluder by both.
         """
         around = frame_box(carried, window)
         if around is None:
             nothing = np.full_like(carried, -_MOST)
-            return nothing, nothing
+            return nothing, nothing, nothing
         crops = [
             FrameCrop.of(image, Window.around(clip_box(one, image.shape) or one, _MARGIN, SIZE))
             for one in (around, box)
@@ -105,12 +106,14 @@ class ObjectNetwork:
         channels[0][_COLOURS] = colours.log_ratio(crops[0].colours) / _COLOUR_SCALE
         channels[0][_MOTION] = _resample(motion, window, by_mask) / _MOTION_SCALE
         channels[0][_HAS_COLOURS] = 1
-        logits = self._run(np.stack(channels))[:, 0]
-        seen = [
-            np.clip(_resample(one, crop.window, window, -2 * _MOST), -_MOST, _MOST)
-            for one, crop in zip(logits, crops, strict=True)
-        ]
-        return seen[0], seen[1]
+        objects, occluders = (
+            [
+                np.clip(_resample(one, crop.window, window, -2 * _MOST), -_MOST, _MOST)
+                for one, crop in zip(maps, crops, strict=True)
+            ]
+            for maps in self._run(np.stack(channels)).swapaxes(0, 1)
+        )
+        return objects[0], objects[1], np.asarray((occluders[0] + occluders[1]) / 2, np.float32)
 
     def _run(self, crops: NDArray[np.float32]) -> NDArray[np.float32]:
         """``(B, 8, S, S)`` to logits ``(B, 2, S, S)``: the visible object, and what is in front of it."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import PluginError
-from tracking3d.frames import Frame, Image, MaskEstimate, Prompt
+from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.trackers.crops import box_of, check_box_in_frame
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
@@ -23,12 +25,16 @@ _CUES = Cues(network=2.0, global_colours=0.5, local_colours=0.5, motion=1.0, bac
 _FIRST_MARGINS = (0.125, 0.2, 0.3)
 """Free space around the box in the crops of the first frame, in which time does not matter."""
 
+_CLOSE = np.ones((5, 5), np.uint8)
+"""Between the outlines of the mask and of what hides a part of it, two pixels may be left."""
+
 
 class SegmentTracker:
     """Mask tracker ``segment``.
 
     In every frame the network sees a crop twice: with the last mask, carried by flow, and colours and motion of the
-    object; and with nothing but a box around it. Its log-odds join those of the tracker ``flow``.
+    object; and with nothing but a box around it. Its log-odds join those of the tracker ``flow``. Its second map says
+    what is in front of the object.
     """
 
     class Options(Options):
@@ -78,18 +84,22 @@ class SegmentTracker:
             network=options.network, global_colours=options.colours, local_colours=options.colours,
             motion=options.motion, background=options.background,
         )  # fmt: skip
-        mask = prompt.mask if prompt.mask is not None else self._first_mask(frame.image, prompt)
+        likely, occluder = self._network.segment_box(frame.image, prompt.box, _FIRST_MARGINS)
+        mask = prompt.mask
+        if mask is None:
+            mask = mask_with_network(frame.image, prompt.box, likely) > 0.5
         self._cue = NetworkCue(self._network, prompt.box)
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, mask, options.segmentation_size, cues, self._cue
         )
-        return self._segmentation.estimate
+        return _with_occluder(self._segmentation.estimate, occluder > 0.5)
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Estimate the mask in the next frame."""
         if self._segmentation is None:
             raise PluginError("The tracker segment must be started with init before it tracks a frame.")
-        return self._segmentation.step(frame.image)
+        estimate = self._segmentation.step(frame.image)
+        return _with_occluder(estimate, self._cue.take_occluder(frame.image.shape))
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Continue from ``mask`` ``(H, W)`` in ``frame``."""
@@ -97,6 +107,10 @@ class SegmentTracker:
             self._segmentation.correct(frame.image, mask)
             self._cue.correct(box)
 
-    def _first_mask(self, image: Image, prompt: Prompt) -> NDArray[np.bool_]:
-        likely = self._network.segment_box(image, prompt.box, _FIRST_MARGINS)
-        return mask_with_network(image, prompt.box, likely) > 0.5
+
+def _with_occluder(estimate: MaskEstimate, occluder: NDArray[np.bool_] | None) -> MaskEstimate:
+    """What the mask takes is the object, whatever the network says; what is close beside an occluder belongs to it."""
+    if occluder is None or estimate.binary is None:
+        return estimate
+    reached = cv2.dilate(occluder.astype(np.uint8), _CLOSE) > 0
+    return replace(estimate, occluder=reached & ~estimate.binary)

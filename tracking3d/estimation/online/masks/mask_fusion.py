@@ -21,8 +21,10 @@ from tracking3d.segmentation import (
     paste_window,
     pixel_features,
     pose_weight,
+    shape_log_odds,
     snap_to_edges,
 )
+from tracking3d.segmentation.colour_models import relative_distance
 from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
@@ -84,6 +86,8 @@ def fuse_mask(
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     odds = blend_with_initial(odds, own, 1 - initial_weight)
+    if (covered := occluder_in_window(observation)) is not None:
+        odds = np.where(covered, shape_log_odds(relative_distance(drawn)), odds)
     support = _extract(image, odds, asked, initial, window)
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
     if not share:  # nothing but the silhouette speaks against the initial mask
@@ -116,9 +120,10 @@ def _extract(
 def update_colours(
     colours: ColourModels | None, observation: Observation, mask: NDArray[np.bool_]
 ) -> ColourModels | None:
-    """The colour models after a frame with ``mask`` ``(H, W)``."""
+    """The colour models after a frame with ``mask`` ``(H, W)``; what is in front of the object is left out."""
     window, image = upsampled_window(observation)
-    return ColourModels.of(as_lab(image), mask_in_window(mask, window), colours)
+    covered = occluder_in_window(observation)
+    return ColourModels.of(as_lab(image), mask_in_window(mask, window), colours, covered)
 
 
 def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
@@ -126,6 +131,14 @@ def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8
     window = replace(observation.window, size=_UPSAMPLING * observation.window.size)
     image = (255 * observation.image.permute(1, 2, 0)).round().clamp(0, 255).cpu().numpy()
     return window, np.ascontiguousarray(image.astype(np.uint8))
+
+
+def occluder_in_window(observation: Observation) -> NDArray[np.bool_] | None:
+    """``(S, S)`` what is in front of the object, in the window of `upsampled_window`; None if nothing is known."""
+    if observation.occluder is None:
+        return None
+    covered = (observation.occluder > 0.5).cpu().numpy()
+    return covered.repeat(_UPSAMPLING, 0).repeat(_UPSAMPLING, 1)
 
 
 def mask_in_window(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
