@@ -81,7 +81,7 @@ def read_truth(folder: Path) -> Truth:
         camera_told=_is_camera_given(folder / "camera.json"),
         T_cam_obj=poses,
         masks=masks or visible_masks,
-        visible_masks=visible_masks if masks else {},
+        visible_masks=visible_masks,
         depth=_depth(folder, index, millimetres),
         mesh=MeshFile(mesh) if mesh.is_file() else None,
         points=points,

@@ -58,7 +58,7 @@ def read_sequence(layout: DatasetLayout, root: Path, name: str) -> Truth:
         camera=files.camera(),
         T_cam_obj=files.poses(),
         masks=masks or visible_masks,
-        visible_masks=visible_masks if masks else {},
+        visible_masks=visible_masks,
         boxes=boxes,
         depth=files.depth(),
         mesh=files.mesh(),

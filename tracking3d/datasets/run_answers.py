@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -65,7 +65,8 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
         held=len(run.frames),
         given=min(records),
         masks={index: MaskFile(run.mask_path(one.index)) for index, one in records.items()},
-        initial_masks=_initial_masks(folder, records),
+        visible_masks=_masks_in(folder, layout.visible_mask_path, records) or None,
+        initial_masks=_masks_in(folder, layout.initial_mask_path, records),
         T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
         lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
         confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
@@ -147,8 +148,10 @@ def _times(
     )
 
 
-def _initial_masks(folder: Path, records: Mapping[int, FrameRecord]) -> dict[int, MaskReference]:
-    files = {index: layout.initial_mask_path(folder, one.index) for index, one in records.items()}
+def _masks_in(
+    folder: Path, path_of: Callable[[Path, int], Path], records: Mapping[int, FrameRecord]
+) -> dict[int, MaskReference]:
+    files = {index: path_of(folder, one.index) for index, one in records.items()}
     return {index: MaskFile(file) for index, file in files.items() if file.is_file()}
 
 

@@ -140,8 +140,9 @@ class Truth:
         camera_told: Whether a tracker is given a camera.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted. The rotation or the
             translation is NaN if only the other is known.
-        masks: The object's mask by frame index, the part behind other things included if the data know it.
-        visible_masks: Only the part that is seen; where it differs from `masks` and is known.
+        masks: The object's mask by frame index, the part behind other things included if the data know it; else those
+            of `visible_masks`.
+        visible_masks: Only the part that is seen, where it is known.
         boxes: The object's box by frame index if it has no mask.
         depth: By frame index.
         mesh: The true shape in object coordinates.
@@ -170,6 +171,10 @@ class Truth:
     millimetres: float | None = None
     symmetries: NDArray[np.float64] = field(default_factory=lambda: np.eye(4)[None])
     symmetry_axis: NDArray[np.float64] | None = None
+
+    def is_visible_part(self, index: int) -> bool:
+        """Whether the mask of frame ``index`` leaves out what is hidden, since the data know no other."""
+        return index in self.masks and self.masks[index] is self.visible_masks.get(index)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -84,8 +84,8 @@ class FrameEstimate:
         revised: Better estimates for earlier frames that this frame made possible; they replace those given before.
         camera: The camera of the full frame that the pose refers to. If the focal length is not given, it changes as
             the solver learns more. None if the estimate does not say: the camera known from the first frame on.
-        occluder: ``(H, W)`` bool, what the mask tracker says is in front of the object; None if it cannot tell. The
-            mask takes in what it hides.
+        occluder: ``(H, W)`` bool, what the mask tracker says is in front of the object; None if it cannot tell. A
+            refined mask takes in what it hides of the object.
         points: Where the points are that `tracking3d.track` was asked to follow; None if it was asked for none.
     """
 

@@ -55,9 +55,18 @@ class Observation:
 
     @cached_property
     def outline_distance(self) -> Tensor:
-        """``(S, S)`` see `outline_distance`; beside what is in front, the mask's outline is not the object's."""
-        known = self.valid if self.occluder is None else self.valid * (self.occluder < 0.5)
-        return outline_distance(self.mask, known)
+        """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`."""
+        return outline_distance(self.mask, self.valid)
+
+    @cached_property
+    def free_outline_distance(self) -> Tensor:
+        """The same, of the outline that is no occluder's: poses are fitted to it.
+
+        Surfaces are not. What something hides in all frames would be free to have any shape.
+        """
+        if self.occluder is None:
+            return self.outline_distance
+        return outline_distance(self.mask, self.valid * (self.occluder < 0.5))
 
     @cached_property
     def target(self) -> PoseTarget:
@@ -69,7 +78,7 @@ class Observation:
             self.valid * self.mask if self.has_mask else self.valid,
             self.valid > 0.5,
             self.mask > 0.5 if self.has_mask else None,
-            self.outline_distance if self.has_mask else None,
+            self.free_outline_distance if self.has_mask else None,
         )
 
 

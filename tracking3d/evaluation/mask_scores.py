@@ -118,7 +118,10 @@ def _share_own(answers: Answers, frames: list[int]) -> float | None:
 
 
 def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
-    masks = [_read_mask(references, index) for references in (answers.masks, answers.initial_masks)]
+    estimated = answers.masks
+    if truth.is_visible_part(index) and answers.visible_masks is not None:
+        estimated = answers.visible_masks
+    masks = [_read_mask(references, index) for references in (estimated, answers.initial_masks)]
     if index in answers.answered:  # no mask is an empty one: it says that the object is nowhere
         masks = [np.zeros(_size(truth, index), bool) if mask is None else mask for mask in masks]
     if index not in truth.masks:

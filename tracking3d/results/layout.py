@@ -112,6 +112,11 @@ def initial_mask_path(folder: Path, index: int) -> Path:
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
+def visible_mask_path(folder: Path, index: int) -> Path:
+    """Path of the mask of what is seen of the object in frame ``index``."""
+    return folder / VISIBLE_MASKS / f"{index:06d}.png"
+
+
 def refuse_root(folder: Path) -> None:
     """Refuse to write into the root of a file system.
 

@@ -45,7 +45,7 @@ def write_visible_masks(folder: Path) -> None:
         mask, occluder = read_mask(path), read_occluder(folder, int(path.stem))
         if mask is not None:
             visible = mask if occluder is None else mask & ~occluder
-            write_mask(folder / layout.VISIBLE_MASKS / path.name, visible)
+            write_mask(layout.visible_mask_path(folder, int(path.stem)), visible)
 
 
 def read_occluder(folder: Path, index: int) -> NDArray[np.bool_] | None:

@@ -7,7 +7,7 @@ When all frames are known, `tracking3d.segmentation.whole_video` does the same w
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.online_features import SOURCES, in_question, log_odds, pixel_features
-from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
+from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight
 
 __all__ = [
     "SOURCES",
@@ -20,6 +20,5 @@ __all__ = [
     "paste_window",
     "pixel_features",
     "pose_weight",
-    "shape_log_odds",
     "snap_to_edges",
 ]

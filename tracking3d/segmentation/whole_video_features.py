@@ -88,9 +88,13 @@ class PixelEvidence:
 
     @property
     def shape(self) -> Plane | None:
-        """``(S, S)`` distance to the outline that surface and hull give the object; None if there is neither."""
-        shapes = [self.distances[name] for name in ("drawn", "wide hull") if name in self.distances]
-        return np.asarray(np.mean(shapes, 0), np.float32) if shapes else None
+        """``(S, S)`` distance to the outline of what surface and hull both contain; None if there are not both.
+
+        The hull has what enough frames show: a part that something hides in all of them is not made up.
+        """
+        if not {"drawn", "wide hull"} <= self.distances.keys():
+            return None
+        return np.minimum(self.distances["drawn"], self.distances["wide hull"])
 
     def sources(self) -> Iterator[tuple[str, Plane]]:
         """Each by name, ``(S, S)``."""

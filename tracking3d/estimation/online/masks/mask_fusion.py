@@ -21,10 +21,8 @@ from tracking3d.segmentation import (
     paste_window,
     pixel_features,
     pose_weight,
-    shape_log_odds,
     snap_to_edges,
 )
-from tracking3d.segmentation.colour_models import relative_distance
 from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
@@ -86,8 +84,6 @@ def fuse_mask(
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     odds = blend_with_initial(odds, own, 1 - initial_weight)
-    if (covered := occluder_in_window(observation)) is not None:
-        odds = np.where(covered, shape_log_odds(relative_distance(drawn)), odds)
     support = _extract(image, odds, asked, initial, window)
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
     if not share:  # nothing but the silhouette speaks against the initial mask
