@@ -59,6 +59,17 @@ def test_a_score_is_a_number_from_0_to_1(score):
     assert "score" in mask_fault(MaskEstimate(None, score), (4, 6))
 
 
+@pytest.mark.parametrize("occluder", [np.zeros((4, 6)), np.zeros((4, 5), bool), "hand"])
+def test_an_occluder_is_a_bool_array_of_the_frame_s_size(occluder):
+    assert "occluder" in mask_fault(MaskEstimate(None, 0.5, "so", occluder), (4, 6))
+
+
+def test_an_occluder_is_passed_on():
+    hand = np.eye(4, 6) > 0
+    answer = GuardedTracker(Tracker(MaskEstimate(np.zeros((4, 6)), 0.5, "so", hand)), "mine").step(FRAME)
+    np.testing.assert_array_equal(answer.occluder, hand)
+
+
 def test_what_the_user_got_wrong_is_told_unchanged_at_the_start_only():
     tracker = GuardedTracker(Tracker(InputError("The box is too small; give another.")), "mine")
     with pytest.raises(InputError, match=r"^The box is too small"):

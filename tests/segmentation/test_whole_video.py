@@ -101,6 +101,35 @@ def test_exact_masks_stay_what_they_are():
     assert min(overlap(mask, frame(number)[1]) for number, mask in found.items()) > 0.97
 
 
+def bar_in_front(first: int) -> np.ndarray:
+    """Eight columns of the frame."""
+    columns = np.arange(160)
+    return np.broadcast_to((columns >= first) & (columns < first + 8), (120, 160))
+
+
+def behind(bar: np.ndarray, number: int) -> Answered:
+    """A frame with a bar in front, which the masks leave out."""
+    image, mask, T = frame(number)
+    image = np.where(bar[..., None], 128, image).astype(np.uint8)
+    return Answered(number, image, mask & ~bar, mask & ~bar, T, 0.9, bar)
+
+
+def test_a_mask_goes_on_behind_what_is_in_front_for_a_while():
+    bar = bar_in_front(70)  # the ball passes behind it
+    found = looked_at([behind(bar, number) for number in range(12)])
+    for number, mask in found.items():
+        truth = frame(number)[1]
+        assert overlap(mask & bar, truth & bar) > 0.7 or np.count_nonzero(truth & bar) < 50
+        assert overlap(mask, truth) > 0.9
+
+
+def test_what_is_hidden_in_every_frame_is_not_made_up():
+    found = looked_at([behind(bar_in_front(60 + 4 * number), number) for number in range(12)])
+    for number, mask in found.items():
+        bar = bar_in_front(60 + 4 * number)  # moves with the ball
+        assert np.count_nonzero(mask & bar) < 0.3 * np.count_nonzero(frame(number)[1] & bar)
+
+
 @pytest.mark.parametrize(
     "frames",
     [

@@ -1,4 +1,4 @@
-"""A mask that the frame's border cuts off has no outline there."""
+"""A mask that the frame's border or an occluder cuts off has no outline there."""
 
 from __future__ import annotations
 
@@ -50,3 +50,23 @@ def test_a_frame_that_is_filled_or_empty_has_no_outline():
         observation = bar(cut=True)
         filled = replace(observation, mask=torch.full((64, 64), value) * observation.valid)
         assert float(filled.outline_distance.abs().max()) == 0
+
+
+def test_beside_an_occluder_poses_see_no_outline_but_surfaces_do():
+    inside = replace(bar(cut=False), valid=torch.ones(64, 64))
+    hand = torch.zeros(64, 64)
+    hand[:, 30:45] = 1  # where the bar ends
+    hidden = replace(inside, occluder=hand)
+    free = hidden.free_outline_distance
+    assert float(free[30, 29]) == -8.5  # the bar goes on to the middle of the hand, beyond which background is nearer
+    assert float(free[:, 30:45].abs().max()) == 0
+    assert float(free[30, 10]) == -0.5
+    torch.testing.assert_close(hidden.outline_distance, inside.outline_distance)
+    torch.testing.assert_close(inside.free_outline_distance, inside.outline_distance)
+
+
+def test_at_half_the_resolution_the_occluder_is_still_there():
+    hand = torch.zeros(64, 64)
+    hand[:, 30:45] = 1
+    half = replace(bar(cut=False), occluder=hand).half
+    assert float(half.free_outline_distance[:, 16:22].abs().max()) == 0

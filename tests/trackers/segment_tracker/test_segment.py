@@ -132,6 +132,28 @@ def test_the_prompt_moves_with_the_mask_and_is_replaced_by_a_correction(monkeypa
     assert all(box[2] >= width for box in prompts)
 
 
+def test_what_is_in_front_comes_with_the_mask_and_only_once():
+    clip = moving_disc((120, 160), 3)
+
+    class Hand(ObjectNetwork):
+        def log_odds(self, image, carried, motion, window, colours, box):
+            by_mask, by_box, occluder = super().log_odds(image, carried, motion, window, colours, box)
+            occluder[:, : occluder.shape[1] // 2] = 4
+            occluder[:, occluder.shape[1] // 2 :] = -4
+            return by_mask, by_box, occluder
+
+    segment = tracker()
+    segment._network = Hand()
+    segment.init(clip.frames[0], clip.prompt(True))
+    estimate = segment.step(clip.frames[1])
+    middle = round(box_of(estimate.binary)[0] + box_of(estimate.binary)[2] / 2)
+    assert not (estimate.occluder & estimate.binary).any()
+    beside = np.roll(clip.mask, 2, axis=1) & ~estimate.binary
+    assert estimate.occluder[:, :middle].any() and not estimate.occluder[:, middle + 8 :].any()
+    assert beside.sum() < 0.1 * clip.mask.sum()
+    assert segment._cue.take_occluder(clip.frames[1].image.shape) is None
+
+
 def test_a_box_outside_and_a_frame_before_the_start_are_refused():
     image = np.zeros((60, 80, 3), np.uint8)
     with pytest.raises(InputError, match="lies outside"):
