@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-import os
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import cv2
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.crops import clip_box
+from tracking3d.trackers.lookahead import Lookahead
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class OpenCvBoxes:
         rectangle = [int(x), int(y), max(round(width), 4), max(round(height), 4)]
         rectangle[0] = max(min(rectangle[0], view.shape[1] - rectangle[2]), 0)
         rectangle[1] = max(min(rectangle[1], view.shape[0] - rectangle[3]), 0)
-        self._announced: tuple[Image, Future[Box | None]] | None = None
+        self._lookahead = Lookahead[Box | None]()
         cv2.setRNGSeed(0)
         try:
             self._tracker.init(view, rectangle)
@@ -70,16 +69,11 @@ class OpenCvBoxes:
 
     def announce(self, image: Image) -> None:
         """Look for the box in another thread already; ``update`` is called with this very image next, if at all."""
-        self._announced = image, _looking().submit(self._find, image)
+        self._lookahead.begin(image, partial(self._find, image))
 
     def update(self, image: Image) -> Box | None:
         """The box in the next image, or None if the tracker has lost the object."""
-        announced, self._announced = self._announced, None
-        if announced is not None:
-            box = announced[1].result()
-            if announced[0] is image:
-                return box
-        return self._find(image)
+        return self._lookahead.result(image, partial(self._find, image))
 
     def _find(self, image: Image) -> Box | None:
         if self._tracker is None:
@@ -97,14 +91,3 @@ class OpenCvBoxes:
         if self._scale == 1:
             return bgr
         return cv2.resize(bgr, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
-
-
-@functools.cache
-def _looking() -> ThreadPoolExecutor:
-    """The thread in which all announced boxes are looked for."""
-    return ThreadPoolExecutor(1, "tracking3d-boxes")
-
-
-# A thread does not survive a fork.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_looking.cache_clear)

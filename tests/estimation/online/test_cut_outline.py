@@ -58,7 +58,9 @@ def test_beside_an_occluder_poses_see_no_outline_but_surfaces_do():
     hand[:, 30:45] = 1  # where the bar ends
     hidden = replace(inside, occluder=hand)
     free = hidden.free_outline_distance
-    assert float(free[30, 29]) == -8.5  # the bar goes on to the middle of the hand, beyond which background is nearer
+    assert (
+        float(free[30, 29]) == -8.5
+    )  # the bar goes on to the middle of the hand, beyond which background is nearer
     assert float(free[:, 30:45].abs().max()) == 0
     assert float(free[30, 10]) == -0.5
     torch.testing.assert_close(hidden.outline_distance, inside.outline_distance)

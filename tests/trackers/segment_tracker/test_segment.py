@@ -124,12 +124,31 @@ def test_the_prompt_moves_with_the_mask_and_is_replaced_by_a_correction(monkeypa
     segment = tracker()
     segment._network = Recording()
     segment.init(clip.frames[0], clip.prompt(True))
-    assert isinstance(segment._cue, NetworkCue)
+    assert isinstance(segment._state.cue, NetworkCue)
     for frame in clip.frames[1:]:
         segment.step(frame)
     centres = [box[0] + box[2] / 2 for box in prompts]
     assert centres == pytest.approx([x + width / 2 + 2 * k for k in (1, 2, 3)], abs=1.5)
     assert all(box[2] >= width for box in prompts)
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_announced_frames_give_the_same_masks(corrected):
+    clip = moving_disc((90, 120), 6)
+
+    def masks(announced: bool) -> list[np.ndarray]:
+        segment = tracker()
+        found = [segment.init(clip.frames[0], clip.prompt(False)).mask]
+        for frame, coming in zip(clip.frames[1:-1], clip.frames[2:], strict=True):
+            found.append(segment.step(frame).mask)
+            if announced:
+                segment.announce(coming)
+            if corrected and frame.index == 2:
+                segment.correct(frame, np.roll(found[-1] > 0.5, 3, axis=0))
+        return [*found, segment.step(clip.frames[-1]).mask]
+
+    for one, other in zip(masks(True), masks(False), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_what_is_in_front_comes_with_the_mask_and_only_once():
@@ -151,7 +170,7 @@ def test_what_is_in_front_comes_with_the_mask_and_only_once():
     beside = np.roll(clip.mask, 2, axis=1) & ~estimate.binary
     assert estimate.occluder[:, :middle].any() and not estimate.occluder[:, middle + 8 :].any()
     assert beside.sum() < 0.1 * clip.mask.sum()
-    assert segment._cue.take_occluder(clip.frames[1].image.shape) is None
+    assert segment._state.cue.take_occluder(clip.frames[1].image.shape) is None
 
 
 def test_a_box_outside_and_a_frame_before_the_start_are_refused():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -45,6 +46,10 @@ class ObjectNetwork:
             resources.files("tracking3d.trackers") / "weights" / "segmentation.onnx"
         ) as own:
             self._network = Network(Path(own), threads)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Itself: a copy of what uses the network shares it."""
+        return self
 
     def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> tuple[Map, Map]:
         """The object in a box, and what is in front of it, by nothing but one image.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Self
 
 import cv2
@@ -11,10 +13,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import PluginError
-from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.frames import Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.crops import box_of, check_box_in_frame
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
+from tracking3d.trackers.lookahead import Lookahead
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segment.cue import NetworkCue
@@ -61,8 +64,8 @@ class SegmentTracker:
     def __init__(self, options: SegmentTracker.Options) -> None:
         self._options = options
         self._network = ObjectNetwork(options.threads)
-        self._segmentation: ColourSegmentation | None = None
-        self._cue: NetworkCue
+        self._state: _TrackerState | None = None
+        self._lookahead = Lookahead[tuple[_TrackerState, MaskEstimate]]()
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -88,24 +91,47 @@ class SegmentTracker:
         mask = prompt.mask
         if mask is None:
             mask = mask_with_network(frame.image, prompt.box, likely) > 0.5
-        self._cue = NetworkCue(self._network, prompt.box)
-        self._segmentation = ColourSegmentation(
-            frame.image, prompt.box, mask, options.segmentation_size, cues, self._cue
-        )
-        return _with_occluder(self._segmentation.estimate, occluder > 0.5)
+        cue = NetworkCue(self._network, prompt.box)
+        segmentation = ColourSegmentation(frame.image, prompt.box, mask, options.segmentation_size, cues, cue)
+        self._lookahead.discard()
+        self._state = _TrackerState(segmentation, cue)
+        return _with_occluder(segmentation.estimate, occluder > 0.5)
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Estimate the mask in the next frame."""
-        if self._segmentation is None:
+        if self._state is None:
             raise PluginError("The tracker segment must be started with init before it tracks a frame.")
-        estimate = self._segmentation.step(frame.image)
-        return _with_occluder(estimate, self._cue.take_occluder(frame.image.shape))
+        self._state, estimate = self._lookahead.result(frame.image, partial(_step, self._state, frame.image))
+        return estimate
+
+    def announce(self, frame: Frame) -> None:
+        """Track the next frame in another thread, on a copy of all that is known; a correction discards it."""
+        if self._state is not None:
+            self._lookahead.begin(frame.image, partial(_step_copy, self._state, frame.image))
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Continue from ``mask`` ``(H, W)`` in ``frame``."""
-        if (box := box_of(mask)) is not None and self._segmentation is not None:
-            self._segmentation.correct(frame.image, mask)
-            self._cue.correct(box)
+        if (box := box_of(mask)) is not None and self._state is not None:
+            self._lookahead.discard()
+            self._state.segmentation.correct(frame.image, mask)
+            self._state.cue.correct(box)
+
+
+@dataclass(frozen=True, eq=False)
+class _TrackerState:
+    """All that changes from frame to frame; both parts change in place."""
+
+    segmentation: ColourSegmentation
+    cue: NetworkCue
+
+
+def _step(state: _TrackerState, image: Image) -> tuple[_TrackerState, MaskEstimate]:
+    estimate = state.segmentation.step(image)
+    return state, _with_occluder(estimate, state.cue.take_occluder(image.shape))
+
+
+def _step_copy(state: _TrackerState, image: Image) -> tuple[_TrackerState, MaskEstimate]:
+    return _step(copy.deepcopy(state), image)
 
 
 def _with_occluder(estimate: MaskEstimate, occluder: NDArray[np.bool_] | None) -> MaskEstimate:
