@@ -15,10 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.truth import MeshFile
 from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.prototypes import from_file
 from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model
 from tracking3d.results.mesh_view import most_different, render_view, side_shown
+from tracking3d.results.unseen_surface import sort_seen_first
 from tracking3d.synthesis.mesh_files import load_solid
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -39,8 +41,13 @@ def accessor(tree: dict, binary: bytes, number: int) -> np.ndarray:
     return np.frombuffer(binary, kind, entry["count"] * columns, start).reshape(-1, columns)
 
 
+def seen_all_round(model: ObjectModel) -> ObjectModel:
+    """A model whose GLB has one primitive, in the order of its faces."""
+    return dataclasses.replace(model, texture_weight=np.ones_like(model.texture_weight))
+
+
 def test_the_glb_holds_positions_texture_coordinates_and_image_as_gltf_defines_them(tmp_path, turning_sphere):
-    model = turning_sphere.model
+    model = seen_all_round(turning_sphere.model)
     export_mesh(tmp_path, model)
     tree, binary = parse_glb((tmp_path / "mesh.glb").read_bytes())
     (primitive,) = [p for mesh in tree["meshes"] for p in mesh["primitives"]]
@@ -99,7 +106,7 @@ def test_vertices_are_doubled_at_the_seam_only(tmp_path, turning_sphere):
 
 
 def test_the_glb_has_one_vertex_for_each_distinct_position_and_texture_coordinate(tmp_path, turning_sphere):
-    model = turning_sphere.model
+    model = seen_all_round(turning_sphere.model)
     # Texture coordinates that differ by rounding are no seam.
     jitter = 1e-12 * np.random.default_rng(0).standard_normal(model.face_uvs.shape)
     export_mesh(tmp_path, dataclasses.replace(model, face_uvs=model.face_uvs + jitter))
@@ -118,7 +125,7 @@ def test_the_glb_has_one_vertex_for_each_distinct_position_and_texture_coordinat
 def test_through_its_scene_graph_the_glb_is_the_obj_turned_half_about_x_with_the_texture(
     tmp_path, turning_sphere
 ):
-    export_mesh(tmp_path, turning_sphere.model)
+    export_mesh(tmp_path, seen_all_round(turning_sphere.model))
     obj, glb = load_mesh(tmp_path), trimesh.load_mesh(tmp_path / "mesh.glb", process=False)
     assert np.allclose(glb.vertices[glb.faces], obj.vertices[obj.faces] * [1, -1, -1], atol=1e-6)
     assert np.allclose(glb.vertex_normals[glb.faces], obj.vertex_normals[obj.faces] * [1, -1, -1], atol=1e-5)
@@ -128,7 +135,7 @@ def test_through_its_scene_graph_the_glb_is_the_obj_turned_half_about_x_with_the
 
 
 def test_a_gltf_camera_in_front_sees_what_the_first_frame_saw(tmp_path, turning_sphere):
-    export_mesh(tmp_path, turning_sphere.model)
+    export_mesh(tmp_path, seen_all_round(turning_sphere.model))
     mesh = trimesh.load_mesh(tmp_path / "mesh.glb", process=False)
     # glTF's camera looks along -z with y up; it stands before the object, at positive z, and its image rows
     # run down. The first frame's camera: the object's axes, at negative z.
@@ -140,7 +147,7 @@ def test_a_gltf_camera_in_front_sees_what_the_first_frame_saw(tmp_path, turning_
 
 
 def test_every_reader_of_meshes_takes_the_glb_for_what_the_obj_is(tmp_path, turning_sphere):
-    export_mesh(tmp_path, turning_sphere.model)
+    export_mesh(tmp_path, sort_seen_first(turning_sphere.model)[0])
     obj, glb = tmp_path / "mesh.obj", tmp_path / "mesh.glb"
 
     def triangles(read):
@@ -162,7 +169,8 @@ def test_a_glb_of_others_is_read_with_the_axes_that_it_has(tmp_path):
 
 
 def test_a_mesh_makes_the_round_trip(tmp_path, turning_sphere):
-    model = turning_sphere.model
+    model, seen = sort_seen_first(turning_sphere.model)
+    assert 0 < seen < len(model.faces)
     export_mesh(tmp_path, model)
     for mesh in (load_mesh(tmp_path), read_mesh_file(tmp_path / "mesh.glb")):
         assert np.allclose(mesh.vertices[mesh.faces], model.vertices[model.faces], atol=1e-6)

@@ -50,6 +50,14 @@ class ContentOptions:
             rich_help_panel=_CONTENT,
         ),
     ] = False
+    unseen: Annotated[
+        str,
+        typer.Option(
+            metavar="close|cut",
+            help="Surface that no frame has shown: keep it, marked, or leave it out.",
+            rich_help_panel=_CONTENT,
+        ),
+    ] = "close"
     images: Annotated[
         bool,
         typer.Option("--images/--no-images", help="Write the images too.", rich_help_panel=_CONTENT),
@@ -179,6 +187,7 @@ def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOp
         compressed_images=content.compressed_images,
         of=content.of,  # type: ignore[arg-type]
         cut_out=content.cut_out,
+        unseen=content.unseen,  # type: ignore[arg-type]
         images=content.images,
         undistorted=content.undistorted,
         frame=content.frame,

@@ -34,7 +34,6 @@ class Answers:
         held: How many frames the method estimated, in the clip or not, if known.
         given: Index of the frame whose mask or box the method was given; it is not scored as a mask.
         masks: By frame index.
-        visible_masks: Without what is in front of the object, by frame index; None if the method cannot tell.
         initial_masks: What the mask tracker gave, by frame index.
         T_cam_obj: ``(4, 4)`` rigid, by frame index; without those that are not rigid.
         lost: Frames that the method called lost.
@@ -48,6 +47,7 @@ class Answers:
         points: Follows points.
         corrected_points: Follows points with the help of the images too.
         tracked: Frames that the method called tracked, if it says so.
+        visible_masks: Without what is in front of the object, by frame index; None if the method cannot tell.
     """
 
     origin: Path
@@ -56,7 +56,6 @@ class Answers:
     held: int | None = None
     given: int | None = None
     masks: Mapping[int, MaskReference] | None = None
-    visible_masks: Mapping[int, MaskReference] | None = None
     initial_masks: Mapping[int, MaskReference] | None = None
     T_cam_obj: Mapping[int, NDArray[np.float64]] | None = None
     lost: frozenset[int] = frozenset()
@@ -70,6 +69,7 @@ class Answers:
     points: PointTracker | None = None
     corrected_points: PointTracker | None = None
     tracked: frozenset[int] | None = None
+    visible_masks: Mapping[int, MaskReference] | None = None
 
     def matched(self, frames: int) -> str:
         """Which frames are scored, in words.

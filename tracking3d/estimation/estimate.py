@@ -109,9 +109,9 @@ class FrameEstimate:
     revised: tuple[FrameEstimate, ...] = ()
     camera: Camera | None = None
     points: PointAnswers | None = None
-    occluder: NDArray[np.bool_] | None = None
     probability: NDArray[np.float32] | None = None
     diagnostics: dict[str, float] = field(default_factory=dict)
+    occluder: NDArray[np.bool_] | None = None
 
     @property
     def visible_mask(self) -> NDArray[np.bool_]:

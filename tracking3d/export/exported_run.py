@@ -21,6 +21,7 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import metres_per_unit, scale_model, scale_pose
+from tracking3d.results.unseen_surface import cut_unseen
 from tracking3d.runtime.progress import report_each
 from tracking3d.video.selection import parse_selection
 
@@ -178,12 +179,21 @@ class ExportedRun:
 
     @cached_property
     def model(self) -> ObjectModel:
-        """The mesh in object coordinates, in the unit of the export.
+        """The mesh in object coordinates, in the unit of the export; with the option ``cut`` of what was seen alone.
 
         Raises:
-            InputError: If the run has none.
+            InputError: If the run has none, or no frame has shown any of it.
         """
-        return scale_model(load_model(self.reader.mesh_folder), self.scale)
+        model = scale_model(load_model(self.reader.mesh_folder), self.scale)
+        if self.options.unseen == "close":
+            return model
+        model = cut_unseen(model)
+        if not len(model.faces):
+            raise InputError(
+                f"No frame of {self.reader.folder} has shown the surface, so that nothing would be left of it; "
+                "export it whole."
+            )
+        return model
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """``(H, W)``: the estimated mask of a frame of `span`; empty if the frame was skipped."""

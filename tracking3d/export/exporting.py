@@ -43,6 +43,7 @@ _NAMED = {
     "source": argument("source=", "--source"),
     "of": argument("of=", "--of"),
     "cut_out": argument("cut_out=", "--cut-out"),
+    "unseen": argument("unseen=", "--unseen"),
     "undistorted": argument("undistorted=", "--undistorted"),
     "images": argument("images=", "--no-images"),
     "start_time": argument("start_time=", "--start-time"),
@@ -158,6 +159,8 @@ def _check(options: ExportOptions) -> None:
         raise InputError(f"Estimates cannot be '{options.answers}'; choose final or causal.")
     if options.of not in ("object", "camera"):
         raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} must be object or camera.")
+    if options.unseen not in ("close", "cut"):
+        raise InputError(f"'{options.unseen}' is no value of {_NAMED['unseen']}; it must be close or cut.")
 
 
 def _frames_with_estimates(exporter: Exporter, run: ExportedRun) -> set[int]:

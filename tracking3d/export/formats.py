@@ -55,6 +55,7 @@ write_vot = _writer("vot_masks", "write_vot")
 
 _LENGTHS = frozenset({"object_size"})
 _TIMED = _LENGTHS | {"fps"}
+_SURFACE = _LENGTHS | {"unseen"}
 _PICTURES = frozenset({"source"})
 _RECORDING = _TIMED | _PICTURES | {"start_time", "compressed_images"}
 _TRAINING = _LENGTHS | _PICTURES | {"cut_out", "images"}
@@ -69,7 +70,7 @@ _ALL = (
         write_tum,
         ".txt",
         "{run}_tum",
-        options=_TIMED | {"of"},
+        options=_TIMED | _SURFACE | {"of"},
     ),
     Exporter("kitti", "poses", "poses, calibration and times of KITTI", write_kitti, options=_TIMED | {"of"}),
     Exporter("csv", "poses", "table of poses", write_csv, ".csv", options=_TIMED),
@@ -179,9 +180,9 @@ _ALL = (
         "{run}_points",
         options=_POINTS,
     ),
-    Exporter("glb", "model", "textured mesh, y up", write_glb, ".glb", options=_LENGTHS),
-    Exporter("ply", "model", "mesh with colours, object coordinates", write_ply, ".ply", options=_LENGTHS),
-    Exporter("stl", "model", "mesh without colours, object coordinates", write_stl, ".stl", options=_LENGTHS),
+    Exporter("glb", "model", "textured mesh, y up", write_glb, ".glb", options=_SURFACE),
+    Exporter("ply", "model", "mesh with colours, object coordinates", write_ply, ".ply", options=_SURFACE),
+    Exporter("stl", "model", "mesh without colours, object coordinates", write_stl, ".stl", options=_SURFACE),
     Exporter(
         "animated-glb",
         "scene",
@@ -189,7 +190,7 @@ _ALL = (
         write_animated_glb,
         ".glb",
         "{run}_animated",
-        options=_TIMED,
+        options=_TIMED | _SURFACE,
     ),
     Exporter(
         "usdz",
@@ -207,7 +208,7 @@ _ALL = (
     Exporter(
         "after-effects", "scene", "script with camera and null", write_after_effects, ".jsx", options=_TIMED
     ),
-    Exporter("nuke", "scene", "camera and axis as .chan, mesh as OBJ", write_nuke, options=_LENGTHS),
+    Exporter("nuke", "scene", "camera and axis as .chan, mesh as OBJ", write_nuke, options=_SURFACE),
     Exporter(
         "rerun",
         "scene",

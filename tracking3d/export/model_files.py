@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
@@ -15,6 +16,7 @@ from trimesh.exchange.stl import export_stl
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.seen_surface import vertex_colours
 from tracking3d.results.mesh_export import glb_file
+from tracking3d.results.unseen_surface import find_seen_vertices
 
 
 def write_glb(run: ExportedRun, path: Path) -> None:
@@ -23,11 +25,16 @@ def write_glb(run: ExportedRun, path: Path) -> None:
 
 
 def write_ply(run: ExportedRun, path: Path) -> None:
-    """Write the mesh in object coordinates, with a colour and a normal a vertex."""
+    """Write the mesh in object coordinates, with a colour, a normal and ``seen``, 0 or 1, a vertex."""
+    model = run.model
     mesh = trimesh.Trimesh(
-        run.model.vertices, run.model.faces, vertex_colors=vertex_colours(run.model), process=False
+        model.vertices,
+        model.faces,
+        vertex_colors=vertex_colours(model),
+        vertex_attributes={"seen": find_seen_vertices(model).astype(np.uint8)},
+        process=False,
     )
-    path.write_bytes(export_ply(mesh, vertex_normal=True))
+    path.write_bytes(export_ply(mesh, vertex_normal=True, include_attributes=True))
 
 
 def write_stl(run: ExportedRun, path: Path) -> None:

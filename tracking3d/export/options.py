@@ -7,6 +7,7 @@ from typing import Literal
 
 Answers = Literal["final", "causal"]
 Of = Literal["object", "camera"]
+Unseen = Literal["close", "cut"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class ExportOptions:
         start_time: Seconds from 1970 to the start of the video, for stamps of clocks; None takes the time at which the
             video was recorded, if it says, else one second.
         compressed_images: Whether the frames are written as JPEG into a recording that can do without.
+        unseen: ``close`` keeps the surface that no frame has shown, which files mark; ``cut`` leaves it out.
     """
 
     answers: Answers = "final"
@@ -42,3 +44,4 @@ class ExportOptions:
     xy: tuple[tuple[float, float], ...] = ()
     start_time: float | None = None
     compressed_images: bool = False
+    unseen: Unseen = "close"

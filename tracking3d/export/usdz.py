@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from tracking3d.errors import OutputError
@@ -19,6 +20,7 @@ from tracking3d.export.axes import HALF_TURN, continuous, quaternion
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.mesh_export import unit_note
+from tracking3d.results.unseen_surface import PALE, UNSEEN, find_seen_faces
 
 _APERTURE = 36.0
 """Millimetres of the film's width; only its ratio to the focal length means anything."""
@@ -112,6 +114,25 @@ def _add_mesh(stage: Any, model: ObjectModel) -> None:
     )
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    _mark_unseen(stage, mesh, np.flatnonzero(~find_seen_faces(model)))
+
+
+def _mark_unseen(stage: Any, mesh: Any, faces: NDArray[np.intp]) -> None:
+    """Bind the faces that no frame has shown to a pale material."""
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
+
+    if not len(faces):
+        return
+    material = UsdShade.Material.Define(stage, f"/tracking3d/{UNSEEN}")
+    surface = UsdShade.Shader.Define(stage, f"/tracking3d/{UNSEEN}/surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*PALE))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    binding = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    indices = Vt.IntArray.FromNumpy(faces.astype(np.int32))
+    subset = binding.CreateMaterialBindSubset(UNSEEN, indices, UsdGeom.Tokens.face)
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
 
 
 def _add_camera(prim: Any, camera: Camera) -> None:

@@ -14,6 +14,8 @@ import trimesh
 
 UPRIGHT_NODE = "tracking3d_y_up"
 OBJECT_NODE = "tracking3d_object"
+UNSEEN_MATERIAL = "unseen"
+"""Name of the material of the faces that no frame has shown; they have texture coordinates, too."""
 UPRIGHT_ROTATION = (1.0, 0.0, 0.0, 0.0)
 """Half a turn about x, as glTF writes it: a quaternion x, y, z, w."""
 
@@ -28,8 +30,19 @@ def read_mesh_file(path: Path) -> trimesh.Trimesh:
         Exception: Whatever trimesh's loaders raise.
     """
     scene = trimesh.load_scene(path, process=False)
+    _share_texture(scene)
     mesh = scene.to_mesh()
     if OBJECT_NODE in scene.graph.nodes:
         upright, _ = scene.graph.get(OBJECT_NODE)
         mesh.apply_transform(np.linalg.inv(upright))
     return mesh
+
+
+def _share_texture(scene: trimesh.Scene) -> None:
+    """Give the unseen part of a run's object the material of the seen one; trimesh would merge both textures."""
+    parts = [part for part in scene.geometry.values() if hasattr(part.visual, "material")]
+    seen = [part for part in parts if part.visual.material.name != UNSEEN_MATERIAL]
+    if len(seen) != 1:
+        return
+    for part in parts:
+        part.visual.material = seen[0].visual.material

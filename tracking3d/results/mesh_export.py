@@ -28,6 +28,12 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import image_file, write_atomic, write_together
 from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
+from tracking3d.results.unseen_surface import (
+    find_seen_faces,
+    group_faces,
+    sort_seen_first,
+    split_primitive,
+)
 from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.runtime.interruption import interrupts_deferred
 
@@ -123,7 +129,7 @@ def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) 
             mtl_name=MTL,
             header=f"tracking3d: {header}",
         )
-    return {OBJ: text.encode(), **files}
+    return {OBJ: group_faces(text, find_seen_faces(model)).encode(), **files}
 
 
 def glb_file(
@@ -133,7 +139,7 @@ def glb_file(
     unit: str = ARBITRARY,
     **more: Any,
 ) -> bytes:
-    """The model as GLB, turned upright.
+    """The model as GLB, turned upright; faces that no frame has shown come last, as a primitive of their own.
 
     Args:
         model: The object.
@@ -149,7 +155,10 @@ def glb_file(
         roughnessFactor=1.0,
     )
 
+    ordered, seen = sort_seen_first(model)
+
     def finish_all(tree: dict[str, Any]) -> None:
+        split_primitive(tree, seen)
         _finish_gltf(tree)
         tree["asset"]["extras"] = unit_note(unit)
         if finish is not None:
@@ -157,7 +166,7 @@ def glb_file(
 
     with interrupts_deferred():  # see `obj_files`
         data: bytes = export_glb(
-            split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
+            split_mesh(ordered, pbr), include_normals=True, tree_postprocessor=finish_all, **more
         )
     return data
 
@@ -283,8 +292,10 @@ def restore_texture(folder: Path) -> bool:
     if (path.is_file() and path.stat().st_size) or not (folder / GLB).is_file():
         return False
     try:
-        mesh: Any = trimesh.load(folder / GLB, force="mesh", process=False)
-        image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"), dtype=np.uint8)
+        scene: Any = trimesh.load_scene(folder / GLB, process=False)
+        materials = [part.visual.material for part in scene.geometry.values()]
+        (texture,) = [one.baseColorTexture for one in materials if one.baseColorTexture is not None]
+        image = np.asarray(texture.convert("RGB"), dtype=np.uint8)
     except Exception:  # the GLB is damaged too
         return False
     write_atomic(path, image_file(image))
