@@ -206,6 +206,8 @@ def test_extras_are_declared():
         ("gltf", {}, "There is no format gltf (to= takes tum, kitti"),
         ("tum", {"cut_out": True}, "does not use cut_out="),
         ("vot", {"object_size": 1.0}, "does not use object_size="),
+        ("tum", {"unseen": "cut"}, "does not use unseen="),
+        ("glb", {"unseen": "guess"}, "'guess' is no value of unseen="),
         ("tum", {"fps": 0.0}, "fps= is 0"),
         ("tum", {"start_time": 5.0}, "does not use start_time="),
         ("csv", {"compressed_images": True}, "does not use compressed_images="),

@@ -6,6 +6,7 @@ import json
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import longest_side
+from tracking3d.results.unseen_surface import find_seen_faces
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 VALIDATE = """
@@ -64,6 +67,37 @@ def test_a_usdz_says_whether_its_unit_is_the_metre(export, run):
     layers = [stage.GetRootLayer() for stage in stages]  # which live as long as their stages
     assert [layer.customLayerData["tracking3d:unit"] for layer in layers] == ["unknown", "metre"]
     assert "not in metres" in layers[0].comment and layers[1].comment == "Lengths are in metres."
+
+
+@pytest.fixture
+def half_seen(run, tmp_path):
+    """The run with a model of whose texture the left half was seen."""
+    folder = shutil.copytree(run, tmp_path / "half_seen")
+    model = load_model(folder)
+    weight = model.texture_weight * (np.arange(model.texture_weight.shape[1]) < 16)
+    export_mesh(folder, replace(model, texture_weight=weight.astype(np.float32)))
+    return folder
+
+
+def test_what_no_frame_has_shown_is_marked_or_cut(export, half_seen):
+    run, seen = half_seen, find_seen_faces(load_model(half_seen))
+    assert 0 < seen.sum() < len(seen)
+    whole, cut = (export(run, "ply", f"{unseen}.ply", unseen=unseen) for unseen in ("close", "cut"))
+    read = [trimesh.load_mesh(one, process=False) for one in (whole, cut)]
+    assert [len(mesh.faces) for mesh in read] == [len(seen), seen.sum()]
+    marks = read[0].metadata["_ply_raw"]["vertex"]["data"]["seen"]
+    assert set(np.unique(marks)) == {0, 1}
+    assert (
+        len(trimesh.load_mesh(export(run, "stl", "cut.stl", unseen="cut"), process=False).faces) == seen.sum()
+    )
+
+
+def test_a_usdz_has_a_subset_of_what_no_frame_has_shown(export, half_seen):
+    pxr, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    stage = pxr.Stage.Open(str(export(half_seen, "usdz", "out.usdz")))
+    subset = geometry.Subset(stage.GetPrimAtPath("/tracking3d/object/mesh/unseen"))
+    unseen = np.flatnonzero(~find_seen_faces(load_model(half_seen)))
+    np.testing.assert_array_equal(np.array(subset.GetIndicesAttr().Get()), unseen)
 
 
 def asset_of(file: Path) -> dict:
