@@ -22,7 +22,7 @@ from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
 from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
-from tracking3d.reconstruction import bake_texture
+from tracking3d.reconstruction import bake_texture, close_unseen
 from tracking3d.results.initial_masks import is_initial_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -285,7 +285,7 @@ class ObjectRecorder:
         if self.refinement is not None:
             self.refinement.draw_rest()
             self._work.wait()
-            model = bake_texture(*self.refinement.final_model(), largest)
+            model = close_unseen(bake_texture(*self.refinement.final_model(), largest))
             self._writer.end_refinement()
             self._causal_model = None
         report_progress("writing the model")

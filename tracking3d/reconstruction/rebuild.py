@@ -17,6 +17,7 @@ from tracking3d.reconstruction.reliable_frames import no_reliable_frame_error, r
 from tracking3d.reconstruction.shape import MOST, reconstruct_shape
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
 from tracking3d.reconstruction.texturing import bake_texture
+from tracking3d.reconstruction.unseen_closing import close_unseen
 from tracking3d.reconstruction.uv_atlas import replace_shape
 from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
 from tracking3d.results import layout
@@ -77,7 +78,7 @@ def retexture_run(
         views = views if view is None else keep_best_views(views, view, most)
     if not views:
         raise no_reliable_frame_error(run)
-    model = bake_texture(model, views, largest)
+    model = close_unseen(bake_texture(model, views, largest))
     _replace_mesh(run, model)
     return model, len(views)
 
@@ -123,11 +124,12 @@ def rebuild_shape(
     judges = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
     made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
-        model = bake_texture(online, views, largest)
+        model = close_unseen(bake_texture(online, views, largest))
         _replace_mesh(run, model)
         return ShapedRun(model, len(views), False, made.sentence)
     report_progress("unwrapping the surface")
-    model = bake_texture(replace_shape(online, made.vertices, made.faces, shapes), views, largest)
+    made_model = replace_shape(online, made.vertices, made.faces, shapes)
+    model = close_unseen(bake_texture(made_model, views, largest))
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
