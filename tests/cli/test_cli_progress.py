@@ -129,7 +129,9 @@ def test_the_plan_of_a_run_has_the_stages_that_its_settings_ask_for():
     config = load_config().model_dump()
     names = [stage.name for stage in plan_run(config, 10)]
     assert (names[0], names[-1]) == ("tracking", "turntable")
-    assert "refining masks" in names and "matching depths" not in names
+    assert "refining masks" in names and "matching depths" in names
+    config["object"]["shape"] = "fast"
+    assert "matching depths" not in [stage.name for stage in plan_run(config, 10)]
     config["solver"]["final_refine"], config["object"]["shape"] = False, "fine"
     names = [stage.name for stage in plan_run(config, 10, report=False)]
     assert "refining masks" not in names and "matching depths" in names and "turntable" not in names

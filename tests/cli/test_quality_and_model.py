@@ -29,7 +29,8 @@ WITH_QUALITY = {
 def test_a_quality_is_no_final_mesh(refused, command, word):
     line = refused(*command.split(), *WITH_MODEL[command], "--model", word)
     assert (
-        line == f"error: --model sets none, fast or fine; {word} is a value of --quality: --quality {word}."
+        line
+        == f"error: --model sets auto, none, fast or fine; {word} is a value of --quality: --quality {word}."
     )
 
 
@@ -51,7 +52,7 @@ def test_an_unknown_quality_is_refused(refused, command):
 
 
 def test_the_mesh_of_an_existing_run_has_no_quality(refused):
-    assert "--model none, fast or fine" in refused("model", "run", "--quality", "best")
+    assert "--model auto, none, fast or fine" in refused("model", "run", "--quality", "best")
 
 
 @pytest.mark.parametrize("word", ["fast", "fine"])

@@ -11,7 +11,7 @@ from tracking3d.errors import InputError
 
 def test_the_words_are_their_own_and_no_word_is_in_both():
     assert [check_quality(word) for word in QUALITIES] == ["draft", "good", "best"]
-    assert [check_model(word) for word in MODELS] == ["none", "fast", "fine"]
+    assert [check_model(word) for word in MODELS] == ["auto", "none", "fast", "fine"]
     assert not set(QUALITIES) & set(MODELS)
 
 
@@ -31,7 +31,7 @@ def test_a_quality_given_as_a_final_mesh_is_sent_to_quality(word):
     with pytest.raises(InputError) as error:
         check_model(word)
     assert error.value.at_the_command_line == (
-        f"--model sets none, fast or fine; {word} is a value of --quality: --quality {word}."
+        f"--model sets auto, none, fast or fine; {word} is a value of --quality: --quality {word}."
     )
     assert f"quality='{word}'" in str(error.value)
 
@@ -40,13 +40,18 @@ def test_a_quality_given_as_a_final_mesh_is_sent_to_quality(word):
 def test_any_other_value_is_refused_by_both(value):
     with pytest.raises(InputError, match="There is no quality"):
         check_quality(value)
-    with pytest.raises(InputError, match="give 'none', 'fast' or 'fine'"):
+    with pytest.raises(InputError, match="give 'auto', 'none', 'fast' or 'fine'"):
         check_model(value)
 
 
 @pytest.mark.parametrize(
     ("word", "key"),
-    [("none", "texture_views: 0"), ("fast", "object.shape: fast"), ("fine", "object.shape: fine")],
+    [
+        ("auto", "object.shape: auto"),
+        ("none", "texture_views: 0"),
+        ("fast", "object.shape: fast"),
+        ("fine", "object.shape: fine"),
+    ],
 )
 def test_a_file_is_told_its_own_key(tmp_path, word, key):
     file = tmp_path / "config.yaml"
@@ -56,7 +61,8 @@ def test_a_file_is_told_its_own_key(tmp_path, word, key):
 
 
 @pytest.mark.parametrize(
-    ("word", "views", "shape"), [("none", 0, "fast"), ("fast", 24, "fast"), ("fine", 24, "fine")]
+    ("word", "views", "shape"),
+    [("auto", 24, "auto"), ("none", 0, "fast"), ("fast", 24, "fast"), ("fine", 24, "fine")],
 )
 @pytest.mark.parametrize("quality", ["good", "best"])
 def test_a_final_mesh_overrides_that_of_the_quality(quality, word, views, shape):

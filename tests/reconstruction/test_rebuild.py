@@ -214,7 +214,7 @@ def test_without_a_texture_from_the_video_the_online_mesh_comes_back_as_it_was(t
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     run = written(tmp_path)
     monkeypatch.setattr(rebuild, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"tracking3d\[model\]"):
+    with pytest.raises(InputError, match="needs scikit-image"):
         rebuild_shape(run)
     assert len(load_model(run).texture) == 16
 

@@ -23,7 +23,7 @@ def _refuse_quality(value: str | None) -> None:
         check_quality(value)
         raise InputError(
             f"--quality {value} sets everything of a run, and this run exists already; choose its mesh by "
-            "--model none, fast or fine."
+            "--model auto, none, fast or fine."
         )
 
 
@@ -67,7 +67,12 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
     """Make the mesh of a run, and return what to print about it."""
     from tracking3d.cli.plans import plan_shape, plan_texture
     from tracking3d.cli.progress import show_progress
-    from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
+    from tracking3d.reconstruction.rebuild import (
+        has_packages,
+        rebuild_shape,
+        restore_online_mesh,
+        retexture_run,
+    )
     from tracking3d.results.run_reader import RunReader
 
     if model == "none":
@@ -76,7 +81,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
             f"{run}: {'the online mesh again' if restored else 'has the online mesh already; it stays as it is'}"
         ]
     frames, outcome = len(RunReader(run).frames), []
-    if model == "fine":
+    if model == "fine" or (model == "auto" and has_packages()):
         with show_progress(quiet, plan_shape(frames)):
             shaped = rebuild_shape(run, source, views, largest)
         made, taken = shaped.model, shaped.views

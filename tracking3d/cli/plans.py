@@ -51,7 +51,8 @@ def plan_run(
     if config.get("solver", {}).get("final_refine"):
         plan += [PlannedStage(name, seconds * count) for name, seconds in _REFINEMENT.items()]
         plan += _TEXTURE
-    if config.get("object", {}).get("shape") == "fine":
+    shape = config.get("object", {}).get("shape")
+    if shape == "fine" or (shape == "auto" and config.get("solver", {}).get("final_refine")):
         plan += plan_shape(count)
     return plan + plan_report(count) if report else plan
 

@@ -11,13 +11,14 @@ from tracking3d.errors import InputError, argument
 
 Quality = Literal["draft", "good", "best"]
 """Tracker, resolution, refinement and final mesh together, fastest first."""
-ModelChoice = Literal["none", "fast", "fine"]
-"""The final mesh: the online map's, with a texture from the video, or with a reconstructed shape too."""
+ModelChoice = Literal["auto", "none", "fast", "fine"]
+"""The final mesh: the online map's, with a texture from the video, with a reconstructed shape, or the best of these."""
 
 QUALITIES: tuple[str, ...] = get_args(Quality)
 MODELS: tuple[str, ...] = get_args(ModelChoice)
 
 _IN_A_FILE = {
+    "auto": "--model, in a file object.shape: auto",
     "none": "--model, in a file object.texture_views: 0",
     "fast": "--model, in a file object.shape: fast",
     "fine": "--model, in a file object.shape: fine",
@@ -56,10 +57,10 @@ def check_model(value: Any) -> ModelChoice:
     if isinstance(value, str) and value in QUALITIES:
         name = argument("model=", "--model")
         other = argument(f"quality= of load_config: quality='{value}'", f"--quality: --quality {value}")
-        raise InputError(f"{name} sets none, fast or fine; {value} is a value of {other}.")
+        raise InputError(f"{name} sets auto, none, fast or fine; {value} is a value of {other}.")
     if not isinstance(value, str) or value not in MODELS:
         name = argument(f"model={format_value(value)}", f"--model {value}")
-        raise InputError(f"{name} is unknown; give 'none', 'fast' or 'fine'.")
+        raise InputError(f"{name} is unknown; give 'auto', 'none', 'fast' or 'fine'.")
     return cast(ModelChoice, value)
 
 
@@ -69,7 +70,7 @@ def set_model(config: PipelineConfig, model: ModelChoice | None) -> PipelineConf
     Raises:
         InputError: The object is known, so that its mesh is fixed, or frames are not re-estimated.
     """
-    if model is None:
+    if model is None or (model == "auto" and config.object.model is not None):
         return config
     shape, name = config.object, argument(f"model='{model}'", f"--model {model}")
     if model != "none" and shape.model is not None:
@@ -84,6 +85,7 @@ def set_model(config: PipelineConfig, model: ModelChoice | None) -> PipelineConf
             "refinement (solver.final_refine); leave it out."
         )
     default = ObjectConfig.model_fields["texture_views"].default
-    views = {"none": 0, "fast": shape.texture_views or default, "fine": shape.texture_views}[model]
-    changed = {"texture_views": views, "shape": "fine" if model == "fine" else "fast"}
+    some = shape.texture_views or default
+    views = {"auto": some, "none": 0, "fast": some, "fine": shape.texture_views}[model]
+    changed = {"texture_views": views, "shape": "fast" if model == "none" else model}
     return config.model_copy(update={"object": shape.model_copy(update=changed)})

@@ -151,11 +151,12 @@ class ObjectConfig(Section):
     max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Maximum side of the texture image of the mesh, in texels."
     )
-    shape: Literal["fast", "fine"] = Field(
-        "fast",
+    shape: Literal["auto", "fast", "fine"] = Field(
+        "auto",
         description=(
             "Shape of the final mesh: fast takes that of the online map; fine reconstructs it from all frames after "
-            "the final refinement, and keeps the result if it explains held-out frames better (extra model)."
+            "the final refinement, and keeps the result if it explains held-out frames better; auto does "
+            "so where that is possible."
         ),
     )
     size: float | None = Field(

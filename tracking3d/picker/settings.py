@@ -79,7 +79,7 @@ def settings_in_words(config: PipelineConfig) -> dict[str, str]:
     textured = shape.texture_views and config.solver.final_refine
     return {
         "tracker": config.tracker.name,
-        "model": "fine" if shape.shape == "fine" else "fast" if textured else "none",
+        "model": shape.shape if textured or shape.shape == "fine" else "none",
         "features": config.features.name,
     }
 

@@ -4,17 +4,40 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.reconstruction.rebuild import rebuild_shape
+from tracking3d.estimation.estimate import Status
+from tracking3d.reconstruction.rebuild import has_packages, rebuild_shape
+from tracking3d.reconstruction.shape import FEWEST, LEAST_TURN, largest_turn
 from tracking3d.results.run_notes import note_in_run
+from tracking3d.results.run_reader import RunReader
 from tracking3d.video.source import FrameSource
 
 
-def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, always: bool = False) -> str:
-    """Reconstruct the shape of a finished run if ``object.shape`` is ``fine``; if that is not possible, the mesh stays.
+def can_reconstruct(folder: Path, config: PipelineConfig, source: FrameSource) -> bool:
+    """Whether a new shape is worth trying: packages and frames are there, and the object turns enough.
 
-    What came of it stands in ``run.json`` under ``shape`` too.
+    Args:
+        folder: The run folder.
+        config: Config of the run.
+        source: Its video.
+    """
+    if not (config.solver.final_refine and config.object.texture_views and source.repeatable):
+        return False
+    rotations = [
+        record.T_cam_obj[:3, :3]
+        for record in RunReader(folder).frames
+        if record.refined and record.status is Status.TRACKED
+    ]
+    return has_packages() and len(rotations) >= FEWEST and largest_turn(np.stack(rotations)) >= LEAST_TURN
+
+
+def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, always: bool = False) -> str:
+    """Reconstruct the shape of a finished run if ``object.shape`` asks for it; if that is not possible, the mesh stays.
+
+    What came of it stands in ``run.json`` under ``shape`` too. With ``auto`` nothing is said if it is not possible.
 
     Args:
         folder: The run folder.
@@ -28,7 +51,8 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
     Raises:
         OutputError: If something cannot be written.
     """
-    if config.object.shape != "fine" and not always:
+    wanted = config.object.shape == "fine" or always
+    if not wanted and not (config.object.shape == "auto" and can_reconstruct(folder, config, source)):
         return ""
     if source.repeatable:
         try:

@@ -73,7 +73,7 @@ def retexture_run(
     model = _online_model(run)
     views: tuple[TextureView, ...] = ()
     for frame, record in reliable_frames(run, source):
-        mask, camera = run.pinhole_mask(frame.index), run.camera_of(record)
+        mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
         view = texture_view(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
         views = views if view is None else keep_best_views(views, view, most)
     if not views:
@@ -202,10 +202,15 @@ def _views_of_frame(
     run: RunReader, frame: Frame, record: FrameRecord
 ) -> tuple[ShapeView, TextureView] | None:
     """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
-    given = run.pinhole_mask(frame.index), run.camera_of(record), np.asarray(record.T_cam_obj)
-    shape = shape_view(frame.index, frame.image, *given)
-    view = texture_view(frame.index, frame.image, *given)
+    pose = run.camera_of(record), np.asarray(record.T_cam_obj)
+    shape = shape_view(frame.index, frame.image, run.pinhole_mask(frame.index), *pose)
+    view = texture_view(frame.index, frame.image, run.visible_pinhole_mask(frame.index), *pose)
     return None if shape is None or view is None else (shape, view)
+
+
+def has_packages() -> bool:
+    """Whether what a shape is made with is installed."""
+    return all(find_spec(name) is not None for name in _NEEDED)
 
 
 def check_packages() -> None:
@@ -214,10 +219,10 @@ def check_packages() -> None:
     Raises:
         InputError: If something is missing; says what to install.
     """
-    if any(find_spec(name) is None for name in _NEEDED):
+    if not has_packages():
         raise InputError(
-            "A new shape needs scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
-            "or leave the mesh as it is."
+            "A new shape needs scikit-image, fast-simplification and xatlas, and one of them is missing: install them "
+            "by pip, or leave the mesh as it is."
         )
 
 

@@ -87,7 +87,7 @@ def reconstruct_shape(
     used = spread_by_rotation(views, _APART, MOST)
     if len(used) < FEWEST or not left_out:
         return _keep_mesh(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
-    if (turn := _turn(used)) < LEAST_TURN:
+    if (turn := largest_turn(np.stack([view.T_cam_obj[:3, :3] for view in used]))) < LEAST_TURN:
         return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
     report_progress("carving the hull")
     start = trimesh.Trimesh(vertices, faces, process=False)
@@ -152,9 +152,8 @@ def _check_shape(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
     return None
 
 
-def _turn(views: Sequence[ShapeView]) -> float:
-    """Degrees between the two views that differ most."""
-    rotations = np.stack([view.T_cam_obj[:3, :3] for view in views])
+def largest_turn(rotations: NDArray[np.float64]) -> float:
+    """Degrees between the two of several rotations ``(N, 3, 3)`` that differ most."""
     traces = np.einsum("nij,mij->nm", rotations, rotations)
     return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
 

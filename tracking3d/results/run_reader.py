@@ -24,6 +24,7 @@ from tracking3d.results.mesh_export import load_mesh
 from tracking3d.results.probabilities import read_probability
 from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
+from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import StageTimes
 
 LONGEST_LINE = 2**20
@@ -200,6 +201,23 @@ class RunReader:
             InputError: If there is none.
         """
         return self.camera.mask_to_pinhole(self.mask(index))
+
+    def visible_mask(self, index: int) -> NDArray[np.bool_]:
+        """What is seen of the object in frame ``index``, ``(H, W)``: its mask without what is in front of it.
+
+        Raises:
+            InputError: If there is no mask, or it is of another size than the frames.
+        """
+        mask, occluder = self.mask(index), read_occluder(self.folder, index)
+        return mask if occluder is None else mask & ~occluder
+
+    def visible_pinhole_mask(self, index: int) -> NDArray[np.bool_]:
+        """The same as the camera of the poses sees it, see `pinhole_mask`.
+
+        Raises:
+            InputError: If there is no mask.
+        """
+        return self.camera.mask_to_pinhole(self.visible_mask(index))
 
     def probability(self, index: int) -> NDArray[np.float32] | None:
         """The object probabilities ``(H, W)`` of the final estimate; None if they were not requested."""

@@ -25,10 +25,10 @@ def model_option(**more: Any) -> Any:
     """The option ``--model``; ``more`` are further arguments of typer's `Option`."""
     return typer.Option(
         "--model",
-        metavar="none|fast|fine",
+        metavar="auto|none|fast|fine",
         callback=_check_model,
         help="Final mesh: none keeps the online texture, fast re-textures from the video, fine also reconstructs the "
-        "shape.",
+        "shape, auto does so where it can.",
         **more,
     )
 
@@ -42,4 +42,4 @@ Quality = Annotated[
         rich_help_panel=SETTINGS,
     ),
 ]
-Model = Annotated[str | None, model_option(show_default="fast", rich_help_panel=SETTINGS)]
+Model = Annotated[str | None, model_option(show_default="auto", rich_help_panel=SETTINGS)]
