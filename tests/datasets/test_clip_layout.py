@@ -182,12 +182,12 @@ def test_visible_masks_are_kept_beside_the_whole_ones_and_the_box_is_of_what_is_
     write_mask(clip / "visible_masks/000000.png", seen)
     (clip / "init.json").unlink()
     truth = read_truth(clip)
-    assert list(truth.visible_masks) == [0] and len(truth.masks) == 3
+    assert list(truth.visible_masks) == [0] and len(truth.masks) == 3 and not truth.is_visible_part(0)
     assert (truth.visible_masks[0].read() == seen).all()
     assert truth.box == (40, 20, 20, 10)
     shutil.rmtree(clip / "masks")
     truth = read_truth(clip)
-    assert (truth.masks[0].read() == seen).all() and not truth.visible_masks
+    assert (truth.masks[0].read() == seen).all() and truth.is_visible_part(0)
 
 
 def test_the_box_is_that_of_init_json_or_else_of_the_first_mask(clip):

@@ -200,7 +200,7 @@ def test_whole_visible_and_rough_masks_are_kept_apart(read, data):
     assert widths == [10, 6, 11]
     assert truth.box == (2, 2, 6, 9)
     alone = read(visible_masks={"files": "{sequence}/seen/*"})
-    assert list(alone.masks) == [0] and not alone.visible_masks
+    assert list(alone.masks) == [0] and alone.is_visible_part(0) and not truth.is_visible_part(0)
 
 
 def test_the_first_pattern_that_leads_somewhere_counts(read, data):

@@ -173,7 +173,7 @@ def test_a_shape_that_cannot_be_told_stays_and_the_result_says_why(clip, config)
 
 def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
     monkeypatch.setattr(rebuild, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'tracking3d\[model\]'"):
+    with pytest.raises(InputError, match="needs scikit-image"):
         track(clip.images, mask=clip.masks[0], config=config, model="fine")
 
 
@@ -181,7 +181,7 @@ def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
     ("asked", "sentence"),
     [
         ({"refine": "yes"}, r"^refine='yes' is neither True nor False"),
-        ({"model": "finest"}, r"^model='finest' is unknown; give 'none', 'fast' or 'fine'"),
+        ({"model": "finest"}, r"^model='finest' is unknown; give 'auto', 'none', 'fast' or 'fine'"),
         (
             {"refine": False, "model": "fast"},
             r"^model='fast' takes the texture .* without the final refinement",

@@ -15,7 +15,11 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[2]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = PYPROJECT["project"]
-OTHER_NAMES = {"torch": "pytorch", "opencv-contrib-python-headless": "py-opencv"}
+OTHER_NAMES = {
+    "torch": "pytorch",
+    "opencv-contrib-python-headless": "py-opencv",
+    "xatlas": "xatlas-python",
+}
 """What conda-forge calls a package of the index."""
 
 
