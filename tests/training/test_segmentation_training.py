@@ -94,10 +94,61 @@ def test_a_mask_without_mistakes_stays_and_strong_mistakes_leave_it_a_mask():
 
 def test_the_learning_rate_rises_stays_and_falls_to_nothing():
     from recipe import Recipe
-    from train import learning_rate
+    from train import learning_rate, progress
 
     recipe = Recipe(
         photos="a", masks="b", pool="c", steps=1000, warm_up=100, cool_down=0.3, learning_rate=1.0
     )
-    rates = [learning_rate(step, recipe) for step in (0, 50, 100, 700, 850, 1000)]
+    rates = [
+        learning_rate(step, progress(step, 0.0, recipe), recipe) for step in (0, 50, 100, 700, 850, 1000)
+    ]
     assert rates == pytest.approx([0.0, 0.5, 1.0, 1.0, 0.5, 0.0])
+    short = recipe.model_copy(update={"seconds": 60.0})
+    assert progress(10, 30.0, short) == 0.5
+    assert progress(900, 30.0, short) == 0.9
+    assert learning_rate(500, progress(500, 60.0, short), short) == 0.0
+
+
+def test_gaps_are_cut_into_the_alpha_of_a_cut_out_and_leave_one_part_of_it():
+    import cv2
+
+    from gaps import with_gaps
+
+    layer = np.random.default_rng(0).integers(0, 255, (120, 90, 4), dtype=np.uint8)
+    whole = cv2.ellipse(np.zeros((120, 90), np.uint8), (45, 60), (40, 55), 0, 0, 360, 255, -1)
+    layer[..., 3] = whole
+    shares = []
+    for seed in range(60):
+        cut = with_gaps(layer, np.random.default_rng(seed))
+        assert cut.shape == layer.shape and cut.dtype == np.uint8
+        assert np.array_equal(cut[..., :3], layer[..., :3])
+        assert (cut[..., 3] <= whole).all()
+        assert cv2.connectedComponents((cut[..., 3] > 127).astype(np.uint8))[0] == 2
+        shares.append(float(cut[..., 3].sum() / whole.sum()))
+    assert np.array_equal(layer[..., 3], whole)
+    assert np.array_equal(
+        with_gaps(layer, np.random.default_rng(3)), with_gaps(layer, np.random.default_rng(3))
+    )
+    assert 0.14 < min(shares) < 0.4
+    assert np.mean(np.array(shares) < 0.95) > 0.8
+
+
+def test_a_network_that_begins_with_exported_weights_answers_as_the_exported_one(tmp_path):
+    pytest.importorskip("onnx")
+    from batches import SamplePool
+    from first_weights import load_exported
+    from network import CHANNELS, SegmentationNetwork
+    from scene_sequences import CANVAS, PLANES
+    from tracking3d.networks.session import Network
+
+    samples = np.random.default_rng(0).integers(0, 255, (4, len(PLANES), CANVAS, CANVAS), dtype=np.uint8)
+    np.save(tmp_path / "train_0000.npy", samples)
+    (tmp_path / "train_0000.csv").write_text("kind,knows_occluder\n" + 4 * "still,0\n", encoding="utf-8")
+    file = FOLDER.parents[1] / "tracking3d" / "trackers" / "weights" / "segmentation.onnx"
+    network = SegmentationNetwork()
+    load_exported(network, file, SamplePool(tmp_path, "train"))
+    crops = torch.rand(2, len(CHANNELS), 64, 64)
+    with torch.no_grad():
+        found = network.eval()(crops).numpy()
+    expected = Network(file).run({"crop": crops.numpy()})["logits"]
+    assert np.allclose(found, expected, atol=1e-3 * np.abs(expected).max())

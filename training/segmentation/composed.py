@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gaps import with_gaps
 from layers import Motion, alpha_of, paste, placed, shadow_of, smeared, warp
 from occluders import cut_sign, draw_gripper, draw_hand, with_arm
-from photometry import Camera, light_over
+from photometry import Camera, light_over, plain_backdrop
 from scene_sequences import CANVAS, OBJECT, Frame, Scene, background_frames
 
 Image = NDArray[np.uint8]
@@ -21,6 +22,15 @@ Matrix = NDArray[np.float64]
 _TURNS = Motion(shift=7, turn=6, scale=0.05, bend=0.05)
 _RESTS = Motion(shift=0.4, turn=0.3, scale=0.004, bend=0.002)
 _LONG_AGO = Motion(shift=6, turn=25, scale=0.1, bend=0.08)
+_GAPS = 0.25
+"""Share of the cut-outs that get gaps."""
+
+_PLAIN = 0.12
+"""Share of the scenes before a plain backdrop."""
+
+_FILLED = 21
+"""Gaps up to so many pixels are what a tracker may take for the object."""
+
 _MIN_COVER = 0.03
 """Share of the object that something has to hide to count as being in front of it."""
 
@@ -52,7 +62,8 @@ class _Actor:
 
 def composed_scene(material: Material, rng: np.random.Generator) -> Scene:
     """A random scene."""
-    photograph = _pick(material.photographs, rng)
+    plain = rng.random() < _PLAIN
+    photograph = plain_backdrop(CANVAS, rng) if plain else _pick(material.photographs, rng)
     backgrounds, camera_motion = background_frames(photograph, rng.random() < 0.4, rng)
     still = rng.random() < 0.25
     object_ = _object(material, camera_motion if still else None, rng)
@@ -69,7 +80,7 @@ def composed_scene(material: Material, rng: np.random.Generator) -> Scene:
         actors.append(_in_front(layer, camera_motion, "thing", rng))
     elif kind == "thing":
         moves = None if rng.random() < 0.5 else camera_motion
-        actors.append(_in_front(_pick(material.objects, rng), moves, "thing", rng))
+        actors.append(_in_front(_cut_out(material, rng), moves, "thing", rng))
     light = [light_over(CANVAS, rng, 0.15)] * 3
     shadow = (
         rng.normal(0, 14),
@@ -86,6 +97,11 @@ def _pick(items: Sequence[Image], rng: np.random.Generator) -> Image:
     return items[int(rng.integers(len(items)))]
 
 
+def _cut_out(material: Material, rng: np.random.Generator) -> Image:
+    layer = _pick(material.objects, rng)
+    return with_gaps(layer, rng) if rng.random() < _GAPS else layer
+
+
 def _path(
     start: Matrix, motion: Motion, rng: np.random.Generator, fixed: list[Matrix] | None = None
 ) -> list[Matrix]:
@@ -98,7 +114,7 @@ def _path(
 
 
 def _object(material: Material, fixed: list[Matrix] | None, rng: np.random.Generator) -> _Actor:
-    layer = _varied(_pick(material.objects, rng), material, rng)
+    layer = _varied(_cut_out(material, rng), material, rng)
     centre = tuple(CANVAS / 2 + rng.uniform(-0.1, 0.1, 2) * OBJECT)
     start = placed(layer, OBJECT * rng.uniform(0.9, 1.1), centre, rng.normal(0, 30), rng.random() < 0.5)
     motion = _RESTS if rng.random() < 0.2 else _TURNS
@@ -143,7 +159,7 @@ def _turned(layer: Image, material: Material, rng: np.random.Generator) -> Image
 
 def _distractor(material: Material, fixed: list[Matrix], rng: np.random.Generator) -> _Actor:
     """Another thing beside the object, behind it, that stays with the background."""
-    layer = _pick(material.objects, rng)
+    layer = _cut_out(material, rng)
     angle, away = rng.uniform(0, 2 * np.pi), OBJECT * rng.uniform(0.45, 1.0)
     centre = (CANVAS / 2 + away * np.cos(angle), CANVAS / 2 + away * np.sin(angle))
     start = placed(layer, OBJECT * rng.uniform(0.4, 1.3), centre, rng.normal(0, 30), rng.random() < 0.5)
@@ -226,6 +242,9 @@ def _render(
         in_front = in_front * (1 - alpha)
         if actor.label == "object":
             visible, whole = alpha.copy(), alpha
+            filled = cv2.morphologyEx(alpha, cv2.MORPH_CLOSE, np.ones((_FILLED, _FILLED), np.uint8))
+            if (filled - alpha).sum() > _MIN_COVER * alpha.sum():
+                confusing.append(filled)
         elif actor.label == "hand":
             in_front = np.maximum(in_front, alpha)
             confusing.append(alpha)

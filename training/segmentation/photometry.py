@@ -58,6 +58,21 @@ class Camera:
         return picture
 
 
+def plain_backdrop(side: int, rng: np.random.Generator) -> Image:
+    """``(side, side, 3)`` RGB: cloth or paper behind a thing, mostly black, grey or white, as on a turntable."""
+    grey = float(
+        rng.choice([rng.uniform(0, 30), rng.uniform(30, 200), rng.uniform(200, 255)], p=[0.45, 0.25, 0.3])
+    )
+    colour = np.full(3, grey) if rng.random() < 0.7 else grey + rng.normal(0, 45, 3)
+    light = light_over(side, rng, float(rng.choice([0.0, 0.1, 0.3])))
+    if rng.random() < 0.3:  # the edge of the table
+        edge = int(rng.uniform(0.4, 0.9) * side)
+        light[edge:] *= rng.uniform(0.7, 1.3)
+    cloth = cv2.GaussianBlur(rng.normal(0, 1, (side, side)).astype(np.float32), (0, 0), rng.uniform(1, 20))
+    cloth *= rng.uniform(0, 5) / max(float(cloth.std()), 1e-6)
+    return np.clip(colour * light[..., None] + cloth[..., None], 0, 255).astype(np.uint8)
+
+
 def light_over(side: int, rng: np.random.Generator, strength: float) -> Float:
     """``(side, side)`` smooth factors of the brightness: a lamp to one side."""
     direction = rng.normal(0, strength, 2)
