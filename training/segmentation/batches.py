@@ -164,8 +164,8 @@ def make_batch(
 
 
 def _recoloured(crop: Float, rng: np.random.Generator) -> Float:
-    contrast, shift = np.exp(rng.normal(0, 0.15)), rng.normal(0, 0.05)
-    tint = rng.normal(0, 0.03, (3, 1, 1))
+    contrast, shift = np.float32(np.exp(rng.normal(0, 0.15))), np.float32(rng.normal(0, 0.05))
+    tint = rng.normal(0, 0.03, (3, 1, 1)).astype(np.float32)
     if rng.random() < 0.05:
         crop = np.broadcast_to(crop.mean(0), crop.shape)
-    return np.clip(crop * contrast + shift + tint, -0.5, 0.5).astype(np.float32)
+    return np.clip(crop * contrast + (shift + tint), np.float32(-0.5), np.float32(0.5))

@@ -40,11 +40,13 @@ def main(mirror: Path, debian: Path, out: Path) -> None:
     for source in sources:
         name = source.get("repository", source.get("package")).replace("/", "+")
         if "repository" in source:
-            files = _files_of_repository(mirror / name, source["paths"])
+            files = _files_of_repository(mirror / name, source["paths"], mixed="most" in source)
         else:
             files = _files_of_package(debian / name)
-        kept = 0
+        kept, most = 0, source.get("most", sys.maxsize)
         for path, data in files:
+            if kept == most:
+                break
             key = hashlib.sha1(data).hexdigest()[:12]
             target = out / name / f"{key}.jpg"
             image = cv2.imread(str(target)) if target.exists() else _photograph(data)
@@ -62,18 +64,22 @@ def main(mirror: Path, debian: Path, out: Path) -> None:
         csv.writer(stream).writerows([("file", "path in its source", "licence", "teach"), *rows])
 
 
-def _files_of_repository(folder: Path, paths: str) -> Iterator[tuple[str, bytes]]:
+def _files_of_repository(folder: Path, paths: str, mixed: bool) -> Iterator[tuple[str, bytes]]:
+    """Paths and contents, in the repository's order or ``mixed``."""
     git_dir = next((d for d in (folder / "repo" / ".git", folder / "repo") if d.is_dir()), None)
     if git_dir is None:
         print(f"       {folder} is missing", flush=True)
         return
     git = ["git", f"--git-dir={git_dir}"]
     listing = subprocess.run([*git, "ls-tree", "-r", "-z", "HEAD"], capture_output=True, check=True).stdout
+    entries = listing.decode("utf-8", "replace").split("\0")
+    if mixed:
+        np.random.default_rng(0).shuffle(entries)
     with subprocess.Popen(
         [*git, "cat-file", "--batch"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as reader:
         assert reader.stdin is not None and reader.stdout is not None
-        for entry in listing.decode("utf-8", "replace").split("\0"):
+        for entry in entries:
             about, _, path = entry.partition("\t")
             if not path.lower().endswith(SUFFIXES) or not re.search(paths, path):
                 continue

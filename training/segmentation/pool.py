@@ -1,4 +1,6 @@
-"""Prepare samples: ``python training/segmentation/pool.py RECIPE.yaml [validation]``; goes on where it was stopped.
+"""Prepare samples: ``python training/segmentation/pool.py RECIPE.yaml [validation | N/M]``.
+
+Goes on where it was stopped. With ``0/2`` and ``1/2`` two processes share the work.
 
 A file ``train_0007.npy`` is ``(N, 8, CANVAS, CANVAS)`` uint8 (`scenes.PLANES`); ``train_0007.csv`` says of which kind
 each sample is and whether its occluder is known. Masks that the teacher has not made yet go into later files.
@@ -32,11 +34,11 @@ _MIN_VISIBLE = 0.3
 _SHARE_OF_ONE_SOURCE = 0.45
 
 
-def main(recipe: Recipe, validation: bool) -> None:
-    """Make what is missing of the pool."""
+def main(recipe: Recipe, validation: bool, part: int, parts: int) -> None:
+    """Make what is missing of the pool, or one of some parts of it."""
     recipe.pool.mkdir(parents=True, exist_ok=True)
     name, count = ("validation", 2) if validation else ("train", recipe.shards)
-    for number in range(count):
+    for number in range(part, count, parts):
         target = recipe.pool / f"{name}_{number:04d}.npy"
         if target.exists():
             continue
@@ -139,5 +141,7 @@ def _hands(recipe: Recipe, validation: bool, rng: np.random.Generator) -> list[N
 
 if __name__ == "__main__":
     if len(sys.argv) not in (2, 3):
-        raise SystemExit("Usage: python training/segmentation/pool.py RECIPE.yaml [validation]")
-    main(read_recipe(Path(sys.argv[1])), len(sys.argv) == 3)
+        raise SystemExit("Usage: python training/segmentation/pool.py RECIPE.yaml [validation | N/M]")
+    what = (sys.argv[2:] or ["0/1"])[0]
+    part, parts = (0, 1) if what == "validation" else map(int, what.split("/"))
+    main(read_recipe(Path(sys.argv[1])), what == "validation", part, parts)

@@ -28,8 +28,14 @@ class Recipe(BaseModel):
     stills: float = Field(
         0.45, ge=0, le=1, description="Share of photographs with the teacher's masks in the pool."
     )
+    first: Path | None = Field(None, description="Exported network whose weights the training begins with.")
     batch: int = 16
+    replay: bool = Field(False, description="Whether the step is recorded and replayed, on a GPU.")
+    workers: int = Field(1, ge=0, description="Processes that make batches.")
     steps: int = Field(30000, description="Steps of the optimizer.")
+    seconds: float | None = Field(
+        None, gt=0, description="The training ends after so many seconds if it is not done before."
+    )
     sizes: dict[int, int] = Field({0: 128, 20000: 160}, description="Step -> side of the crops from then on.")
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3

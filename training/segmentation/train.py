@@ -10,18 +10,20 @@ import copy
 import csv
 import sys
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from torch import nn
+from torch.utils.data import DataLoader, Dataset
 
-from batches import Batch, SamplePool, make_batch
-from loss import map_loss
+from batches import SamplePool, make_batch
+from first_weights import load_exported
 from network import SegmentationNetwork
 from recipe import Recipe, read_recipe
+from stepping import Batch, Stepper
 from validate import MEASURES, validate
 
 _REPORT_EVERY, _REFRESH_EVERY = 50, 200
@@ -33,91 +35,103 @@ def train(recipe: Recipe, out: Path) -> None:
     torch.set_num_threads(recipe.threads)
     cv2.setNumThreads(1)
     torch.manual_seed(recipe.seed)
-    network = SegmentationNetwork().to(recipe.device).to(memory_format=torch.channels_last).train()
+    network = SegmentationNetwork()
+    held_out = SamplePool(recipe.pool, "validation")
+    if recipe.first is not None:
+        load_exported(network, recipe.first, SamplePool(recipe.pool, "train"))
+    network = network.to(recipe.device).to(memory_format=torch.channels_last).train()
     average = copy.deepcopy(network).eval()
-    optimizer = torch.optim.AdamW(
-        network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay
-    )
-    first = _resume(out / "checkpoint.pt", network, average, optimizer)
-    pool, held_out = SamplePool(recipe.pool, "train"), SamplePool(recipe.pool, "validation")
-    start, sums = time.monotonic(), np.zeros(2)
-    with ThreadPoolExecutor(1) as ahead:
-        batch = ahead.submit(_batch, pool, recipe, first + 1)
-        for step in range(first + 1, recipe.steps + 1):
-            batch, present = _turn(ahead, batch, pool, recipe, step + 1)
-            sums += _step(network, optimizer, present, recipe, step)
-            _follow(average, network, min(recipe.average, step / (step + 10)))
-            if step % _REPORT_EVERY == 0:
-                row = step, time.monotonic() - start, len(pool), *(sums / _REPORT_EVERY)
-                _write_row(out / "losses.csv", ("step", "seconds", "samples", "object", "occluder"), row)
-                sums[:] = 0
-            if step % recipe.validate_every == 0 and len(held_out):
-                _write_row(out / "validation.csv", ("step", *MEASURES), (step, *validate(average, held_out)))
-            if step % recipe.checkpoint_every == 0 or step == recipe.steps:
-                _save(out / "checkpoint.pt", network, average, optimizer, step)
+    stepper = Stepper(network, recipe)
+    first = _resume(out / "checkpoint.pt", network, average, stepper)
+    steps = _Steps(recipe)
+    for size_from in recipe.sizes if recipe.replay else ():
+        stepper.record(steps[size_from])
+    follow = _follower(average, network)
+    start, sums = time.monotonic(), torch.zeros(2, device=recipe.device)
+    for step, batch in enumerate(_batches(steps, recipe, first), first + 1):
+        done = progress(step, time.monotonic() - start, recipe)
+        sums += stepper(batch, learning_rate(step, done, recipe))
+        follow(min(recipe.average, step / (step + 10)))
+        if step % _REPORT_EVERY == 0:
+            row = step, time.monotonic() - start, int(batch[3]), *(sums / _REPORT_EVERY).tolist()
+            _write_row(out / "losses.csv", ("step", "seconds", "samples", "object", "occluder"), row)
+            sums.zero_()
+        if step % recipe.validate_every == 0 and len(held_out):
+            measured = validate(_on_cpu(average), held_out)
+            _write_row(out / "validation.csv", ("step", *MEASURES), (step, *measured))
+        if step % recipe.checkpoint_every == 0 or done >= 1:
+            _save(out / "checkpoint.pt", network, average, stepper.optimizer, step)
+        if done >= 1:
+            break
 
 
-def learning_rate(step: int, recipe: Recipe) -> float:
-    """Rising, then constant, then falling to 0: a run can be made longer until it falls."""
-    left = (recipe.steps - step) / max(recipe.cool_down * recipe.steps, 1)
+def progress(step: int, seconds: float, recipe: Recipe) -> float:
+    """How much of the training is done, 0 to 1: by its steps, or by its time if that is over before."""
+    return max(step / recipe.steps, seconds / recipe.seconds if recipe.seconds else 0.0)
+
+
+def learning_rate(step: int, done: float, recipe: Recipe) -> float:
+    """Rising, then constant, then falling to 0 when the training is ``done`` (1)."""
+    left = (1 - done) / max(recipe.cool_down, 1e-6)
     return recipe.learning_rate * min(1.0, step / recipe.warm_up, max(left, 0.0))
 
 
-def _turn(
-    ahead: ThreadPoolExecutor, batch: Future[Batch], pool: SamplePool, recipe: Recipe, step: int
-) -> tuple[Future[Batch], Batch]:
-    """Wait for a batch, and have the next one made."""
-    present = batch.result()
-    if step % _REFRESH_EVERY == 0:
-        pool.refresh()
-    return ahead.submit(_batch, pool, recipe, step), present
+class _Steps(Dataset):
+    """By the number of a step, its inputs, targets, whether the occluder is known, and how large the pool was."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe = recipe
+        self._pool = SamplePool(recipe.pool, "train")
+        self._calls = 0
+
+    def __getitem__(self, step: int) -> Batch:
+        self._calls += 1
+        if self._calls % _REFRESH_EVERY == 0:
+            self._pool.refresh()
+        recipe = self._recipe
+        size = recipe.sizes[max(start for start in recipe.sizes if start <= step)]
+        indices = np.random.default_rng([recipe.seed, 2, step]).integers(0, len(self._pool), recipe.batch)
+        draw = recipe.box_only, recipe.keep_colours, recipe.keep_motion
+        batch = make_batch(self._pool, indices, draw, size, [recipe.seed, 3, step])
+        inputs, targets = (
+            torch.from_numpy(values.astype(np.float16)) for values in (batch.inputs, batch.targets)
+        )
+        return inputs, targets, torch.from_numpy(batch.knows_occluder), len(self._pool)
 
 
-def _batch(pool: SamplePool, recipe: Recipe, step: int) -> Batch:
-    size = recipe.sizes[max(start for start in recipe.sizes if start <= step)]
-    indices = np.random.default_rng([recipe.seed, 2, step]).integers(0, len(pool), recipe.batch)
-    draw = recipe.box_only, recipe.keep_colours, recipe.keep_motion
-    return make_batch(pool, indices, draw, size, [recipe.seed, 3, step])
+def _batches(steps: _Steps, recipe: Recipe, first: int) -> Iterator[Batch]:
+    return iter(
+        DataLoader(
+            steps, batch_size=None, sampler=range(first + 1, recipe.steps + 1),
+            num_workers=recipe.workers, pin_memory=recipe.device.startswith("cuda"),
+            worker_init_fn=lambda _: cv2.setNumThreads(1),
+        )
+    )  # fmt: skip
 
 
-def _step(
-    network: nn.Module, optimizer: torch.optim.Optimizer, batch: Batch, recipe: Recipe, step: int
-) -> tuple[float, float]:
-    for group in optimizer.param_groups:
-        group["lr"] = learning_rate(step, recipe)
-    inputs, targets, known = (
-        torch.from_numpy(values).to(recipe.device)
-        for values in (batch.inputs, batch.targets, batch.knows_occluder)
-    )
-    with torch.autocast(recipe.device.partition(":")[0], torch.bfloat16):
-        logits = network(inputs.to(memory_format=torch.channels_last))
-    logits = logits.float()
-    object_ = map_loss(logits[:, 0], targets[:, 0], torch.ones_like(known), recipe.overlap_loss)
-    # Photographs with the teacher's masks mostly have nothing in front, but nobody looked.
-    occluder = map_loss(logits[:, 1], targets[:, 1], known.clamp_min(0.1), recipe.overlap_loss)
-    optimizer.zero_grad(set_to_none=True)
-    (object_ + recipe.occluder_loss * occluder).backward()
-    torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-    optimizer.step()
-    return float(object_.detach()), float(occluder.detach())
+def _on_cpu(network: nn.Module) -> nn.Module:
+    return copy.deepcopy(network).cpu()
 
 
-def _follow(average: nn.Module, network: nn.Module, decay: float) -> None:
-    with torch.no_grad():
-        for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
-            if mean.dtype.is_floating_point:
-                mean.lerp_(value, 1 - decay)
-            else:
-                mean.copy_(value)
+def _follower(average: nn.Module, network: nn.Module) -> Callable[[float], None]:
+    """What moves the average towards the network, given the share that stays."""
+    pairs = list(zip(average.state_dict().values(), network.state_dict().values(), strict=True))
+    means, values = zip(*(pair for pair in pairs if pair[0].dtype.is_floating_point), strict=True)
+
+    def follow(decay: float) -> None:
+        with torch.no_grad():
+            torch._foreach_lerp_(means, values, 1 - decay)
+
+    return follow
 
 
-def _resume(file: Path, network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer) -> int:
+def _resume(file: Path, network: nn.Module, average: nn.Module, stepper: Stepper) -> int:
     if not file.exists():
         return 0
-    state = torch.load(file, weights_only=True)
+    state = torch.load(file, weights_only=True, map_location="cpu")
     network.load_state_dict(state["network"])
     average.load_state_dict(state["average"])
-    optimizer.load_state_dict(state["optimizer"])
+    stepper.resume(state["optimizer"])
     return state["step"]
 
 
