@@ -29,6 +29,8 @@ _FOOT = """
 Validation keeps {kept} of the photographs apart (`split.py`): one in sixteen of every source, some kinds of things, and
 two whole sources. Data that the product is judged on (DAVIS, BOP, HO3D, YCBInEOAT and the repositories of test clips)
 are not among the sources.
+
+The weights that this training began with are of an earlier collection, listed in `SOURCES_FIRST.md`.
 """
 
 
