@@ -24,7 +24,11 @@ from tracking3d.trackers.segment.cue import NetworkCue
 from tracking3d.trackers.segment.network import ObjectNetwork
 from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
-_CUES = Cues(network=2.0, global_colours=0.5, local_colours=0.5, motion=1.0, background=0.5)
+_CUES = Cues(
+    # The network knows outlines; the last one would keep a side out that turns into view, and gaps closed.
+    prior=0.5, outline=0.0, novelty=0.0,
+    network=3.0, global_colours=0.5, local_colours=0.5, motion=1.0, background=0.5,
+)  # fmt: skip
 _FIRST_MARGINS = (0.125, 0.2, 0.3)
 """Free space around the box in the crops of the first frame, in which time does not matter."""
 
@@ -83,10 +87,14 @@ class SegmentTracker:
         """Start from a box or a mask; the prompt's mask is the first estimate, else the box is segmented."""
         check_box_in_frame(prompt.box, frame)
         options = self._options
-        cues = Cues(
-            network=options.network, global_colours=options.colours, local_colours=options.colours,
-            motion=options.motion, background=options.background,
-        )  # fmt: skip
+        cues = replace(
+            _CUES,
+            network=options.network,
+            global_colours=options.colours,
+            local_colours=options.colours,
+            motion=options.motion,
+            background=options.background,
+        )
         likely, occluder = self._network.segment_box(frame.image, prompt.box, _FIRST_MARGINS)
         mask = prompt.mask
         if mask is None:
