@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import cv2
@@ -18,6 +18,7 @@ from tracking3d.trackers.mask_motion import MaskMotion
 from tracking3d.trackers.outline import prior, shift_to
 
 _NEIGHBOURHOOD = 0.22  # radius within which local colours count, relative to the square root of the area
+_FAVOURED = 3.0
 _SMOOTHNESS, _EDGES = 100.0, 12.0  # lambda and sigma of the fast global smoother
 
 
@@ -50,6 +51,20 @@ class Cues:
     box: float = 1.0
     network: float = 0.0
     smoother: bool = True
+
+    def favour_colours(self, share: float) -> Self:
+        """The weights where colours tell the object from its surroundings: they count more, a network less.
+
+        Args:
+            share: How far they do, in [0, 1]; at 1 colours have three times their weight, and the network a third.
+        """
+        factor = _FAVOURED**share
+        return replace(
+            self,
+            network=self.network / factor,
+            global_colours=self.global_colours * factor,
+            local_colours=self.local_colours * factor,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,10 @@ _LEAST_PART = 0.1  # of the usual area; less than this at the frame's border cou
 _LEAST_PIXELS = 9  # of the crop; fewer are no mask
 _PATIENCE = 3  # doubtful frames in a row before each attempt to re-initialize
 _SLACK = 0.1  # of a box's sides: it may be drawn too small
+_SEPARATING = (
+    2.0,
+    2.7,
+)  # median log-ratio of the object's colours, at most 3, from and up to which they are favoured
 _FAR = 0.3  # of the root of the area: what is further from the mask is background
 _PARTED = 3.0  # pixels by which something moved as the background does rather than with the object, to be it
 _FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found after it was out of sight
@@ -150,7 +154,8 @@ class ColourSegmentation:
         if area < _LEAST_PIXELS:
             return _out_of_sight(image)
 
-        evidence = colour_and_motion(last, present, self._colours, self._palette, motion, self._cues)
+        cues = self._weigh(present, moved)
+        evidence = colour_and_motion(last, present, self._colours, self._palette, motion, cues)
         if self._cues.background:
             if motion.background is None:
                 self._background.lose()
@@ -159,7 +164,7 @@ class ColourSegmentation:
             evidence += self._cues.background * self._background.change(image, present.window)
         if self._network is not None:
             said = self._network.log_odds(image, present, motion, self._colours, box)
-            evidence += self._cues.network * said
+            evidence += cues.network * said
         if witness is not None:
             evidence -= self._cues.box * distance_beyond(witness, present.window)
         mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
@@ -182,6 +187,14 @@ class ColourSegmentation:
         agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
         return full, Judgement(separation, margin, agreement, believed)
+
+    def _weigh(self, present: FrameCrop, moved: NDArray[np.bool_]) -> Cues:
+        """The cues' weights in a frame: a network knows less than colours that are the object's alone."""
+        if self._network is None:
+            return self._cues
+        median = float(np.median(self._colours.log_ratio(present.colours)[moved]))
+        none, full = _SEPARATING
+        return self._cues.favour_colours(min(max((median - none) / (full - none), 0.0), 1.0))
 
     def _search(self, image: Image) -> _Answer:
         """The mask of what has the object's colours, if anything has, after the object was out of sight."""

@@ -15,6 +15,7 @@ from tracking3d.frames import Frame, Prompt
 from tracking3d.testing import check_tracker
 from tracking3d.testing.clips import moving_disc
 from tracking3d.trackers.crops import box_of
+from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
 from tracking3d.trackers.segment.cue import NetworkCue, _settle
@@ -195,3 +196,26 @@ def test_real_clips_from_a_box(shared_data: Path, monkeypatch: pytest.MonkeyPatc
     assert len(results) >= 4
     assert np.mean(results) > 0.83
     assert min(results) > 0.7
+
+
+def test_colours_are_favoured_as_far_as_they_are_the_object_s_alone():
+    cues = Cues(network=3.0, global_colours=0.5, local_colours=0.5)
+    assert cues.favour_colours(0.0) == cues
+    full = cues.favour_colours(1.0)
+    assert (full.network, full.global_colours, full.local_colours) == pytest.approx((1.0, 1.5, 1.5))
+    assert (full.motion, full.prior) == (cues.motion, cues.prior)
+
+
+def test_a_ring_of_another_colour_than_the_background_keeps_its_hole():
+    yy, xx = np.mgrid[:160, :200]
+    images = []
+    for shift in range(6):
+        radius = np.hypot(xx - 80 - 3 * shift, yy - 80)
+        ring = (radius < 45) & (radius > 22)
+        images.append((np.where(ring[..., None], (230, 190, 60), (20, 20, 25)).astype(np.uint8), ring))
+    segment = tracker()
+    image, ring = images[0]
+    segment.init(Frame(0, image), Prompt((35.0, 35.0, 90.0, 90.0)))
+    for index, (image, ring) in enumerate(images[1:], 1):
+        estimate = segment.step(Frame(index, image))
+    assert iou(estimate.binary, ring) > 0.85
