@@ -253,4 +253,4 @@ def test_the_page_of_the_tracker_auto_shows_the_masks_of_the_one_that_it_stands_
         str(clip), None, tracking, CameraOptions(), SettingsOptions(), pick_module._configure
     )
     assert menu.chosen.tracker == "auto"
-    assert menu.configure(menu.chosen).tracker.name in ("csrt", "onnx", "flow")
+    assert menu.configure(menu.chosen).tracker.name in ("segment", "csrt", "onnx", "flow")

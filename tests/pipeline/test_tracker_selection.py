@@ -20,6 +20,7 @@ from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.pipeline.tracker_selection import CANDIDATES, check_tracker_options, choose_tracker
 from tracking3d.results.run_reader import RunReader
 from tracking3d.trackers.csrt import CsrtTracker
+from tracking3d.trackers.segment.tracker import SegmentTracker
 from tracking3d.video import open_source
 
 FIRST = Frame(0, np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8))
@@ -73,12 +74,14 @@ def chosen(frames: int | None = 100, live: bool = False) -> tuple[str, dict, str
 def test_without_networks_it_is_the_best_that_needs_none(machine):
     machine()
     name, options, why = chosen()
-    assert (name, options) == ("csrt", {})
+    assert (name, options) == ("segment", {})
     assert "no network of a better one is in your cache" in why
 
 
-def test_where_opencv_lacks_the_correlation_filter_it_is_flow(machine, monkeypatch):
+def test_where_opencv_lacks_what_the_better_ones_need_it_is_flow(machine, monkeypatch):
     machine()
+    monkeypatch.setattr(SegmentTracker, "why_unavailable", classmethod(lambda cls: "it is another wheel"))
+    assert chosen()[0] == "csrt"
     monkeypatch.setattr(CsrtTracker, "why_unavailable", classmethod(lambda cls: "it is another wheel"))
     assert chosen()[0] == "flow"
 
@@ -97,20 +100,20 @@ def test_what_a_long_video_cannot_afford_is_left(machine):
     _, options, why = chosen(frames=1500)
     assert options["every"] == 5
     assert "which rules out MobileSAM in NanoTrack's box" in why
-    assert chosen(frames=30_000)[0] == "csrt"
+    assert chosen(frames=30_000)[0] == "segment"
     assert chosen(frames=None)[1]["every"] == 5
-    assert chosen(live=True)[0] == "csrt"
+    assert chosen(live=True)[0] == "segment"
 
 
 def test_networks_that_do_not_run_are_no_candidates(machine):
     machine(*NETWORKS, broken=True)
-    assert chosen()[0] == "csrt"
+    assert chosen()[0] == "segment"
 
 
 def test_damaged_networks_are_not_there(machine, tmp_path):
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "u2netp.onnx").write_bytes(b"not it")
-    assert chosen()[0] == "csrt"
+    assert chosen()[0] == "segment"
 
 
 def test_candidates_are_trackers_with_options_of_theirs_the_best_first():
@@ -137,15 +140,15 @@ def test_a_run_says_which_it_was_and_goes_on_with_it(monkeypatch, tmp_path):
     images = [FIRST.image] * 3
     record(open_source(images), AUTO, tmp_path / "run", box=PROMPT.box)
     run = RunReader(tmp_path / "run")
-    assert run.config["tracker"]["name"] == "csrt"
-    assert run.description["tracker_choice"].startswith("csrt (")
+    assert run.config["tracker"]["name"] == "segment"
+    assert run.description["tracker_choice"].startswith("segment (")
 
     def refuse(*given):
         raise AssertionError("it is known already")
 
     monkeypatch.setattr("tracking3d.pipeline.open_tracking.choose_tracker", refuse)
     record(open_source(images), AUTO, tmp_path / "run", box=PROMPT.box, resume=True)
-    assert json.loads((tmp_path / "run/run.json").read_text())["config"]["tracker"]["name"] == "csrt"
+    assert json.loads((tmp_path / "run/run.json").read_text())["config"]["tracker"]["name"] == "segment"
 
 
 def test_the_library_tracks_with_it(monkeypatch, tmp_path):

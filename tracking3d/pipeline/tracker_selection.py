@@ -68,6 +68,7 @@ CANDIDATES = (
         "onnx", "U2Netp in NanoTrack 3's box, every 5th frame", 0.904, 0.24, _U2_FILES + _NANO3_FILES,
         _U2 | _NANO3 | {"every": 5},
     ),
+    TrackerCandidate("segment", "segment, whose network comes with the package", 0.903, 0.05),
     TrackerCandidate(
         "onnx", "U2Netp in NanoTrack's box, every 5th frame", 0.894, 0.25, _U2_FILES + _NANO_FILES,
         _U2 | _NANO | {"every": 5},
@@ -131,13 +132,16 @@ def choose_tracker(
 
 
 def _is_usable() -> Iterator[TrackerCandidate]:
-    """The candidates whose networks are in the cache, whole; ``csrt`` if this OpenCV has its correlation filter."""
+    """The candidates whose networks are in the cache, whole; ``segment`` and ``csrt`` if this OpenCV allows them."""
     from tracking3d.trackers.csrt import CsrtTracker
+    from tracking3d.trackers.segment.tracker import SegmentTracker
 
     known = known_networks()
     whole: dict[str, bool] = {}
     for candidate in CANDIDATES:
         if candidate.name == "csrt" and CsrtTracker.why_unavailable():
+            continue
+        if candidate.name == "segment" and SegmentTracker.why_unavailable():
             continue
         for name in candidate.networks:
             if name not in whole:
