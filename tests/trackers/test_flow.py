@@ -201,13 +201,13 @@ def test_a_correction_keeps_a_witness_that_is_on_the_object_and_renews_one_that_
     frames, truth = moving_shape(4)
     flow = tracker(witness="csrt")
     flow.init(frames[0], Prompt(box_around(truth[0])))
-    learnt = flow._witness
+    learnt = flow._box_tracker
     flow.step(frames[1])
     flow.correct(frames[1], truth[1])
-    assert flow._witness is learnt
+    assert flow._box_tracker is learnt
     flow.step(frames[2])
     flow.correct(frames[2], np.roll(truth[2], 20, axis=1))
-    assert flow._witness is not learnt
+    assert flow._box_tracker is not learnt
 
 
 def test_an_empty_correction_changes_nothing() -> None:
@@ -238,7 +238,7 @@ def test_a_witness_that_disagrees_lowers_the_score() -> None:
     prompt = Prompt(box_around(truth[0]), truth[0])
     flow = tracker(witness="kcf")
     flow.init(frames[0], prompt)
-    flow._witness.update = lambda image: (0.0, 0.0, 20.0, 20.0)
+    flow._box_tracker.update = lambda image: (0.0, 0.0, 20.0, 20.0)
     misled = flow.step(frames[1])
     assert misled.reason == "the mask and the box tracker disagree"
     assert misled.score < track(frames, prompt)[1].score - 0.3

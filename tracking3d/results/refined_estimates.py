@@ -69,7 +69,7 @@ class RefinedEstimates:
         return read_mask(layout.initial_mask_path(self._folder, index))
 
     def occluder(self, index: int) -> NDArray[np.bool_] | None:
-        """What the mask tracker said is in front of the object in frame ``index``, ``(H, W)`` bool, or None."""
+        """What is in front of the object, by the mask tracker, in frame ``index``, ``(H, W)`` bool, or None."""
         return read_occluder(self._folder, index)
 
     def visible(self, index: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

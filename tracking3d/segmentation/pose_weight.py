@@ -1,4 +1,4 @@
-"""How far a pose may redraw an initial mask: a doubted one not at all, one behind an occluder alone."""
+"""How far a pose redraws an initial mask: a doubtful one not at all. Behind an occluder the shape alone counts."""
 
 from __future__ import annotations
 

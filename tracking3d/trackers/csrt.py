@@ -94,7 +94,7 @@ class CsrtTracker:
         if self._segmentation is None or self._boxes is None:
             raise PluginError("The tracker csrt must be started with init before it tracks a frame.")
         self._followed = self._boxes.update(frame.image)
-        box = self._witness
+        box = self._tracked_box
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:
             return MaskEstimate(estimate.mask, estimate.score / 2, "CSR-DCF has lost the object")
@@ -111,14 +111,14 @@ class CsrtTracker:
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
-        witness = self._witness
-        if self._followed is None or witness is None or box_iou(witness, box) < STRAYED:
+        tracked = self._tracked_box
+        if self._followed is None or tracked is None or box_iou(tracked, box) < STRAYED:
             self._begin(frame.image, box)
         else:
             self._offset = BoxOffset.between(self._followed, box)
 
     @property
-    def _witness(self) -> Box | None:
+    def _tracked_box(self) -> Box | None:
         """The box as the last correction had it; None if the box tracker has lost the object."""
         return None if self._followed is None else self._offset.apply(self._followed)
 

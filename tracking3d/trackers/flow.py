@@ -22,7 +22,7 @@ from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 _CUES = Cues()
-_WITNESSES = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF"}  # in OpenCV's contrib modules
+_BOX_TRACKERS = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF"}  # in OpenCV's contrib modules
 
 
 class FlowTracker:
@@ -77,22 +77,22 @@ class FlowTracker:
             "none", description="Box tracker that checks the mask and recovers it if it is lost."
         )
         witness_weight: float = Field(
-            _CUES.box, ge=0, le=100, description="Weight of the distance outside the box of `witness`."
+            _CUES.box, ge=0, le=100, description="Weight of the distance outside the box tracker's box."
         )
 
     def __init__(self, options: FlowTracker.Options) -> None:
         self._options = options
         self._segmentation: ColourSegmentation | None = None
-        self._witness: OpenCvBoxes | None = None
-        self._witnessed: Box | None = None
+        self._box_tracker: OpenCvBoxes | None = None
+        self._tracked_box: Box | None = None
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
         """Build the tracker from its validated options."""
         if not isinstance(options, FlowTracker.Options):
             raise PluginError("The tracker flow was given the options of another tracker.")
-        witness = _WITNESSES.get(options.witness)
-        if witness and (why := why_no_contrib(witness)):
+        needed = _BOX_TRACKERS.get(options.witness)
+        if needed and (why := why_no_contrib(needed)):
             raise PluginError(f"The box tracker {options.witness} of the tracker flow cannot be used: {why}.")
         return cls(options)
 
@@ -114,16 +114,16 @@ class FlowTracker:
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, prompt.mask, size=options.segmentation_size, cues=cues
         )
-        self._witness = _witness(options.witness, frame.image, prompt.box)
-        self._witnessed = prompt.box
+        self._box_tracker = _start_box_tracker(options.witness, frame.image, prompt.box)
+        self._tracked_box = prompt.box
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Estimate the mask in the next frame."""
         if self._segmentation is None:
             raise PluginError("The tracker flow must be started with init before it tracks a frame.")
-        self._witnessed = self._witness.update(frame.image) if self._witness else None
-        return self._segmentation.step(frame.image, self._witnessed)
+        self._tracked_box = self._box_tracker.update(frame.image) if self._box_tracker else None
+        return self._segmentation.step(frame.image, self._tracked_box)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Continue from ``mask`` ``(H, W)`` in ``frame``; re-initialize the box tracker too if it has drifted."""
@@ -131,11 +131,14 @@ class FlowTracker:
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
-        if self._witnessed is None or box_iou(self._witnessed, box) < STRAYED:
-            self._witness, self._witnessed = _witness(self._options.witness, frame.image, box), box
+        if self._tracked_box is None or box_iou(self._tracked_box, box) < STRAYED:
+            self._box_tracker, self._tracked_box = (
+                _start_box_tracker(self._options.witness, frame.image, box),
+                box,
+            )
 
 
-def _witness(name: str, image: Image, box: Box) -> OpenCvBoxes | None:
+def _start_box_tracker(name: str, image: Image, box: Box) -> OpenCvBoxes | None:
     if name == "csrt":
         return BoxTracker(CsrtTracker.Options(), image, box)
     return OpenCvBoxes(cv2.TrackerKCF.create(), image, box) if name == "kcf" else None

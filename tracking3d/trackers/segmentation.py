@@ -122,25 +122,25 @@ class ColourSegmentation:
             self._colours.update(view.colours, *both_sides(crop_window(self._mask, view.window)))
             self._background.forget(mask)
 
-    def step(self, image: Image, witness: Box | None = None) -> MaskEstimate:
+    def step(self, image: Image, tracked_box: Box | None = None) -> MaskEstimate:
         """Segment the next frame.
 
         Args:
             image: ``(H, W, 3)`` uint8 RGB.
-            witness: ``(x, y, w, h)``, a box tracker's opinion, or None if there is none.
+            tracked_box: ``(x, y, w, h)``, a box tracker's opinion, or None if there is none.
         """
-        witness = None if witness is None else clip_box(witness, image.shape)
+        tracked_box = None if tracked_box is None else clip_box(tracked_box, image.shape)
         box = box_of(self._mask)
-        mask, judgement = self._search(image) if box is None else self._follow(image, box, witness)
+        mask, judgement = self._search(image) if box is None else self._follow(image, box, tracked_box)
         self._doubtful_frames = self._doubtful_frames + 1 if judgement.doubt else 0
-        if witness is not None and self._doubtful_frames >= _PATIENCE:
-            mask, judgement = self._restart(image, witness, mask, judgement)
+        if tracked_box is not None and self._doubtful_frames >= _PATIENCE:
+            mask, judgement = self._restart(image, tracked_box, mask, judgement)
             self._doubtful_frames = 0
         self._velocity = _shift(box, box_of(mask))
         self._image, self._mask, self._judgement = image, mask, judgement
         return self.estimate
 
-    def _follow(self, image: Image, box: Box, witness: Box | None) -> _Answer:
+    def _follow(self, image: Image, box: Box, tracked_box: Box | None) -> _Answer:
         before = Window.around(box, _MARGIN, self._size)
         right, down = self._velocity
         last = FrameCrop.of(self._image, before)
@@ -165,8 +165,8 @@ class ColourSegmentation:
         if self._network is not None:
             said = self._network.log_odds(image, present, motion, self._colours, box)
             evidence += cues.network * said
-        if witness is not None:
-            evidence -= self._cues.box * distance_beyond(witness, present.window)
+        if tracked_box is not None:
+            evidence -= self._cues.box * distance_beyond(tracked_box, present.window)
         mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
 
         at_border = touches_border(moved, present.in_frame)
@@ -184,7 +184,9 @@ class ColourSegmentation:
             far = inside_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
             self._learn_background(image, present, around, np.where(far, 1, -motion.cue / _PARTED))
         full = paste_mask(mask, present.window, image.shape)
-        agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
+        agreement = (
+            None if tracked_box is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), tracked_box)
+        )
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
         return full, Judgement(separation, margin, agreement, believed)
 
@@ -207,11 +209,11 @@ class ColourSegmentation:
         return paste_mask(mask, window, image.shape), Judgement(separation, margin=separation)
 
     def _restart(
-        self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
+        self, image: Image, tracked_box: Box, mask: NDArray[np.float32], judgement: Judgement
     ) -> _Answer:
         """Segment from the box tracker's box; keep the old mask unless the new one looks more like the object."""
-        fresh = mask_in_box(image, witness)
-        view = FrameCrop.of(image, Window.around(witness, _MARGIN, self._size))
+        fresh = mask_in_box(image, tracked_box)
+        view = FrameCrop.of(image, Window.around(tracked_box, _MARGIN, self._size))
         separation = self._separation(view, crop_window(fresh, view.window))
         in_sight = box_of(mask) is not None
         if separation <= (judgement.separation if in_sight else _FOUND_AGAIN * self._first_separation):

@@ -206,12 +206,12 @@ def test_a_text_file_of_regions_leads_the_segmentation(tmp_path, kind):
 
 
 def test_pixels_of_boxes_are_counted_from_one_and_those_of_polygons_from_zero(tmp_path, monkeypatch):
-    witnesses = []
+    boxes = []
     step = ColourSegmentation.step
 
-    def spy(self, image, witness=None):
-        witnesses.append(witness)
-        return step(self, image, witness)
+    def spy(self, image, tracked_box=None):
+        boxes.append(tracked_box)
+        return step(self, image, tracked_box)
 
     monkeypatch.setattr(ColourSegmentation, "step", spy)
     file = tmp_path / "disc.txt"
@@ -220,7 +220,7 @@ def test_pixels_of_boxes_are_counted_from_one_and_those_of_polygons_from_zero(tm
     d3s.init(disc_at(50)[0], Prompt(BOX))
     d3s.step(disc_at(54, 1)[0])
     d3s.step(disc_at(54, 2)[0])
-    assert witnesses == [(24, 30, 60, 60), (24, 30, 60, 60)]
+    assert boxes == [(24, 30, 60, 60), (24, 30, 60, 60)]
 
 
 def test_a_damaged_text_file_is_refused(tmp_path):
