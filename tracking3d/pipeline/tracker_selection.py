@@ -68,7 +68,7 @@ CANDIDATES = (
         "onnx", "U2Netp in NanoTrack 3's box, every 5th frame", 0.904, 0.24, _U2_FILES + _NANO3_FILES,
         _U2 | _NANO3 | {"every": 5},
     ),
-    TrackerCandidate("segment", "segment, whose network comes with the package", 0.903, 0.05),
+    TrackerCandidate("segment", "segment, whose network comes with the package", 0.904, 0.05),
     TrackerCandidate(
         "onnx", "U2Netp in NanoTrack's box, every 5th frame", 0.894, 0.25, _U2_FILES + _NANO_FILES,
         _U2 | _NANO | {"every": 5},
