@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.table import Column
 
 from tracking3d.cli.remaining_time import PlannedStage, RemainingTime, duration_in_words, estimate_in_words
+from tracking3d.runtime.garbage_collection import collection_deferred
 from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ def load_with_progress(module: str, quiet: bool, kernels: bool = False) -> None:
         quiet: Show nothing meanwhile.
         kernels: Whether compiled kernels will be needed: those that are missing are compiled in the background.
     """
-    with show_progress(quiet):
+    with show_progress(quiet), collection_deferred():
         import_module(module)
         if kernels:
             import_module("tracking3d.speed.kernels_ahead").compile_in_background(quiet)

@@ -23,6 +23,7 @@ from tracking3d.cli.pick import settings_menu
 from tracking3d.cli.split import track_in_parts
 from tracking3d.cli.tracking import RunDisplay, RunRequest, a_person_is_there, default_folder, track
 from tracking3d.errors import InputError
+from tracking3d.runtime.garbage_collection import collection_deferred
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
@@ -65,7 +66,7 @@ def run(
         raise InputError("A known object has its own unit; leave out --object-size, or --object.")
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
-    with show_progress(quiet):  # plug-ins are imported to check their options
+    with show_progress(quiet), collection_deferred():  # plug-ins are imported to check their options
         config = _configure(prompt, camera, tracking, settings, output, performance)
     check_model_source(settings.model, source)
     folder = output.out or default_folder(source)

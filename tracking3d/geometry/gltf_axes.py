@@ -8,9 +8,12 @@ that the mesh itself stays in object coordinates.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 UPRIGHT_NODE = "tracking3d_y_up"
 OBJECT_NODE = "tracking3d_object"
@@ -29,6 +32,8 @@ def read_mesh_file(path: Path) -> trimesh.Trimesh:
     Raises:
         Exception: Whatever trimesh's loaders raise.
     """
+    import trimesh  # slow to import
+
     scene = trimesh.load_scene(path, process=False)
     _share_texture(scene)
     mesh = scene.to_mesh()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from tracking3d.errors import InputError
 from tracking3d.geometry.gltf_axes import read_mesh_file
+
+if TYPE_CHECKING:
+    import trimesh
 
 FARTHEST = 1e9
 """No vertex lies farther out, in whatever unit; beyond, squares and products of coordinates lose all digits."""
@@ -47,6 +50,8 @@ def what_is_wrong(mesh: object) -> str:
     Args:
         mesh: What trimesh made of a file.
     """
+    import trimesh  # slow to import
+
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         return "holds no triangles"
     if not np.isfinite(mesh.vertices).all():

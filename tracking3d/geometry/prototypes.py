@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
@@ -21,6 +20,18 @@ LONGEST_EDGE = 0.25
 """A user's mesh is refined until its edges are shorter than this, in units of its radius."""
 MOST_FACES = 10_000
 """But not beyond this number of faces."""
+_SHORT, _LONG = 0.5257311121191336, 0.85065080835204  # 1 and the golden ratio, as a vector of length 1
+_ICOSAHEDRON = (
+    *((x, y, 0.0) for y in (_LONG, -_LONG) for x in (-_SHORT, _SHORT)),
+    *((0.0, y, z) for z in (_LONG, -_LONG) for y in (-_SHORT, _SHORT)),
+    *((x, 0.0, z) for x in (_LONG, -_LONG) for z in (-_SHORT, _SHORT)),
+)
+_ICOSAHEDRON_FACES = (
+    *((0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11)),
+    *((1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8)),
+    *((3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9)),
+    *((4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)),
+)
 
 
 def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -28,9 +39,8 @@ def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int6
 
     There is a vertex at each end of the y axis, where the atlas has its poles.
     """
-    solid = trimesh.creation.icosahedron()
-    sine, cosine, _ = solid.vertices[1]  # lies in the plane z = 0
-    upright = solid.vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    sine, cosine, _ = _ICOSAHEDRON[1]  # lies in the plane z = 0
+    upright = np.array(_ICOSAHEDRON) @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     corners: list[NDArray[np.float64]] = []
     faces: list[NDArray[np.int64]] = []
     steps = [(i, j) for i in range(frequency + 1) for j in range(frequency + 1 - i)]
@@ -38,9 +48,9 @@ def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int6
     weights = np.array([(frequency - i - j, i, j) for i, j in steps]) / frequency
     cells = [(row[i, j], row[i + 1, j], row[i, j + 1]) for i, j in steps if i + j < frequency]
     cells += [(row[i + 1, j], row[i + 1, j + 1], row[i, j + 1]) for i, j in steps if i + j < frequency - 1]
-    for face in solid.faces:
+    for face in _ICOSAHEDRON_FACES:
         faces.append(np.array(cells) + len(steps) * len(corners))
-        corners.append(weights @ upright[face])
+        corners.append(weights @ upright[list(face)])
     # Vertices on shared edges are computed from both sides: merge them.
     points = np.concatenate(corners)
     _, first, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
@@ -87,6 +97,8 @@ def from_file(path: Path) -> Mesh:
     Raises:
         InputError: If the file is missing or holds no triangle mesh.
     """
+    import trimesh  # slow to import
+
     advice = "give an OBJ, PLY, STL or GLB file"
     if not _is_file(path):
         raise InputError(f"The prototype '{path}' does not exist; give sphere, ellipsoid or a mesh file.")

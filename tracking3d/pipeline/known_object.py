@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.config.camera import choose_camera
@@ -23,6 +23,9 @@ from tracking3d.rendering.face_atlas import face_atlas, on_faces, paint_faces, s
 from tracking3d.rendering.texture import sample_texture
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import trimesh
 
 _OBJECT = argument("object=", "--object ")
 _ADVICE = "give the folder of an earlier run, or a mesh file such as GLB, OBJ, PLY or STL"
@@ -96,6 +99,8 @@ def select_camera(
 
 
 def _of_run(folder: Path) -> KnownObject:
+    import trimesh  # slow to import
+
     run = RunReader(folder)
     try:
         model = load_model(run.mesh_folder)
@@ -164,6 +169,8 @@ def _orient_outward(
     Returns:
         Vertices ``(V, 3)`` and faces ``(F, 3)``, which of the mesh's faces these are, and whether each is turned round.
     """
+    import trimesh  # slow to import
+
     size = float(np.ptp(mesh.vertices, axis=0).max())
     _, first, inverse = np.unique(
         np.round(mesh.vertices / (1e-6 * size)), axis=0, return_index=True, return_inverse=True
@@ -198,6 +205,8 @@ def _texture(
 
 def _colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float64] | None:
     """``(F, 3, 3)`` in [0, 255] of the faces' corners; None if the file has none, or one for all."""
+    import trimesh  # slow to import
+
     if not isinstance(mesh.visual, trimesh.visual.ColorVisuals) or mesh.visual.kind not in ("vertex", "face"):
         return None
     colours = np.asarray(mesh.visual.vertex_colors, np.float64)[:, :3]

@@ -12,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
@@ -89,6 +88,8 @@ def fit_to_outlines(
         faces: ``(F, 3)``.
         views: The frames.
     """
+    import trimesh  # slow to import
+
     smooth = _laplacian(faces, len(vertices))
     hold = _SMOOTH * (smooth.T @ smooth) + _SMALL * identity(len(vertices))
     farthest = _FARTHEST * float(np.linalg.norm(np.ptp(vertices, axis=0)))

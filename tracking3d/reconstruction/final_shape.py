@@ -9,8 +9,6 @@ import numpy as np
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.reconstruction.rebuild import has_packages, rebuild_shape
-from tracking3d.reconstruction.shape import FEWEST, LEAST_TURN, largest_turn
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.source import FrameSource
@@ -24,6 +22,9 @@ def can_reconstruct(folder: Path, config: PipelineConfig, source: FrameSource) -
         config: Config of the run.
         source: Its video.
     """
+    from tracking3d.reconstruction.rebuild import has_packages
+    from tracking3d.reconstruction.shape import FEWEST, LEAST_TURN, largest_turn
+
     if not (config.solver.final_refine and config.object.texture_views and source.repeatable):
         return False
     rotations = [
@@ -51,6 +52,8 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
     Raises:
         OutputError: If something cannot be written.
     """
+    from tracking3d.reconstruction.rebuild import rebuild_shape  # slow to import, and only needed at the end
+
     wanted = config.object.shape == "fine" or always
     if not wanted and not (config.object.shape == "auto" and can_reconstruct(folder, config, source)):
         return ""

@@ -14,14 +14,11 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
-from trimesh.exchange.gltf import export_glb
-from trimesh.exchange.obj import export_obj
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
@@ -36,6 +33,9 @@ from tracking3d.results.unseen_surface import (
 )
 from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.runtime.interruption import interrupts_deferred
+
+if TYPE_CHECKING:
+    import trimesh
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
@@ -113,6 +113,9 @@ def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) 
         header: Which coordinates these are, for who opens the file.
         texture: Its texture, if it is encoded already.
     """
+    import trimesh  # slow to import
+    from trimesh.exchange.obj import export_obj
+
     simple = trimesh.visual.material.SimpleMaterial(
         texture or _Texture(model),
         diffuse=(255, 255, 255),
@@ -148,6 +151,9 @@ def glb_file(
         unit: Unit of length of the model, ``arbitrary`` or ``metre``; it is noted in ``asset.extras``.
         more: Further arguments of trimesh's ``export_glb``.
     """
+    import trimesh  # slow to import
+    from trimesh.exchange.gltf import export_glb
+
     pbr = trimesh.visual.material.PBRMaterial(
         name=Path(TEXTURE).stem,
         baseColorTexture=texture or _Texture(model),
@@ -191,6 +197,8 @@ def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -
     Faces keep their order. Texture coordinates have trimesh's origin, the lower left. Normals are those of
     the unsplit mesh, so that the seam does not show.
     """
+    import trimesh  # slow to import
+
     corner, face_uvs = model.faces.ravel(), model.face_uvs.reshape(-1, 2)
     places = model.vertices[corner].astype(np.float32)
     distinct = np.concatenate([places, np.round(face_uvs / _ROUNDING)], axis=1)
@@ -217,6 +225,8 @@ def load_mesh(folder: Path) -> trimesh.Trimesh:
     Raises:
         InputError: If the run has no mesh, or it cannot be read.
     """
+    import trimesh  # slow to import
+
     path = _existing(folder / OBJ)
     try:
         mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
@@ -232,6 +242,8 @@ def load_mesh(folder: Path) -> trimesh.Trimesh:
 
 def _mesh_fault(mesh: Any) -> str:
     """Why that is no surface, or nothing."""
+    import trimesh  # slow to import
+
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return "has no faces"
     return _surface_fault(np.asarray(mesh.vertices), np.asarray(mesh.faces))

@@ -7,7 +7,6 @@ import math
 import cv2
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -90,6 +89,8 @@ def render_view(
         size: Side in pixels.
         texture: See `texture_of_views`; made here if left out. Several views of one object share it.
     """
+    import trimesh  # slow to import
+
     texture = texture_of_views(model, size) if texture is None else texture
     low, high = model.vertices.min(0), model.vertices.max(0)
     centred = (model.vertices - (low + high) / 2) @ rotation.T

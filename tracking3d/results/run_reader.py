@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
@@ -26,6 +25,9 @@ from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
 from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import StageTimes
+
+if TYPE_CHECKING:
+    import trimesh
 
 LONGEST_LINE = 2**20
 """Bytes of a line of ``frames.jsonl``; no run writes one as long."""

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.config.models import ObjectConfig
@@ -245,6 +244,8 @@ def longest_side(vertices: NDArray[np.float64]) -> float:
     Raises:
         InputError: If the vertices have no extent.
     """
+    import trimesh  # slow to import
+
     try:
         longest = float(max(trimesh.bounds.oriented_bounds(vertices)[1]))
     except Exception:  # a flat or otherwise degenerate hull

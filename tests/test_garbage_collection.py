@@ -1,0 +1,44 @@
+"""Garbage is left alone while modules are imported."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+
+from tracking3d.runtime.garbage_collection import collection_deferred
+
+
+@pytest.fixture(autouse=True)
+def unfrozen():
+    yield
+    gc.unfreeze()
+
+
+def test_no_collection_within_and_collection_afterwards():
+    with collection_deferred():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+
+
+def test_what_is_alive_at_the_end_is_never_looked_at_again():
+    before = gc.get_freeze_count()
+    with collection_deferred():
+        alive = [[] for _ in range(1000)]
+    assert gc.get_freeze_count() >= before + len(alive)
+
+
+def test_collection_that_was_disabled_stays_disabled():
+    gc.disable()
+    try:
+        with collection_deferred():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_an_error_within_enables_collection_again():
+    with pytest.raises(ValueError), collection_deferred():
+        raise ValueError
+    assert gc.isenabled()
