@@ -431,7 +431,7 @@ def test_the_shape_is_made_anew_once_and_the_run_says_what_came_of_it(
 ):
     made = []
     monkeypatch.setattr(
-        "tracking3d.reconstruction.final_shape.rebuild_shape",
+        "tracking3d.reconstruction.rebuild.rebuild_shape",
         lambda folder, source: made.append(folder) or SimpleNamespace(sentence="It is better."),
     )
     assert "It is better." in call("run", clip, *BOX, *options, "--out", "run").stdout

@@ -374,7 +374,7 @@ def test_a_shape_that_was_interrupted_is_reconstructed_when_the_run_is_resumed(
 
     folder, config = tmp_path / "run", settings("object.shape=fine")
     with monkeypatch.context() as patch, pytest.raises(Stopped):
-        patch.setattr("tracking3d.reconstruction.final_shape.rebuild_shape", stop)
+        patch.setattr("tracking3d.reconstruction.rebuild.rebuild_shape", stop)
         record(open_source(str(images)), config, folder, mask=clip.masks[0])
     assert RunReader(folder).state == "finished" and "shape" not in RunReader(folder).description
     record(open_source(str(images)), config, folder, mask=clip.masks[0], resume=True)

@@ -13,7 +13,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.reconstruction import final_shape
+from tracking3d.reconstruction import final_shape, rebuild
 from tracking3d.reconstruction.final_shape import make_final_shape
 
 FINE = PipelineConfig.model_validate({"object": {"shape": "fine"}})
@@ -34,7 +34,7 @@ def described(run):
 def test_what_came_of_it_is_said_and_kept(run, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        final_shape,
+        rebuild,
         "rebuild_shape",
         lambda *given: asked.append(given) or SimpleNamespace(sentence="Better."),
     )
@@ -47,7 +47,7 @@ def test_a_run_whose_shape_cannot_be_made_anew_stays_as_it_is_and_says_why(run, 
     def refuse(*given):
         raise InputError("The packages are not there; install them.")
 
-    monkeypatch.setattr(final_shape, "rebuild_shape", refuse)
+    monkeypatch.setattr(rebuild, "rebuild_shape", refuse)
     assert make_final_shape(run, FINE, VIDEO) == "The packages are not there; install them."
     assert described(run)["state"] == "finished"
     camera = SimpleNamespace(name="camera 0", repeatable=False)
@@ -55,7 +55,7 @@ def test_a_run_whose_shape_cannot_be_made_anew_stays_as_it_is_and_says_why(run, 
 
 
 def test_nothing_is_done_where_nothing_is_asked(run, monkeypatch):
-    monkeypatch.setattr(final_shape, "rebuild_shape", lambda *given: pytest.fail("was not asked for"))
+    monkeypatch.setattr(rebuild, "rebuild_shape", lambda *given: pytest.fail("was not asked for"))
     fast = PipelineConfig.model_validate({"object": {"shape": "fast"}})
     assert make_final_shape(run, fast, VIDEO) == ""
     assert described(run) == {"state": "finished"}
@@ -85,14 +85,14 @@ def records(count, degrees, refined=True, status="tracked"):
 )
 def test_by_default_it_is_made_where_it_can_be(run, monkeypatch, frames, config, video, done):
     monkeypatch.setattr(final_shape, "RunReader", lambda folder: SimpleNamespace(frames=frames))
-    monkeypatch.setattr(final_shape, "rebuild_shape", lambda *_: SimpleNamespace(sentence="Better."))
+    monkeypatch.setattr(rebuild, "rebuild_shape", lambda *_: SimpleNamespace(sentence="Better."))
     said = make_final_shape(run, PipelineConfig.model_validate(config), video)
     assert said == ("Better." if done else "")
 
 
 def test_without_the_packages_nothing_is_tried_by_default(run, monkeypatch):
     monkeypatch.setattr(final_shape, "RunReader", lambda folder: SimpleNamespace(frames=records(12, 40)))
-    monkeypatch.setattr(final_shape, "has_packages", lambda: False)
+    monkeypatch.setattr(rebuild, "has_packages", lambda: False)
     assert make_final_shape(run, PipelineConfig(), VIDEO) == ""
 
 

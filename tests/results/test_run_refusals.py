@@ -131,7 +131,7 @@ def test_a_full_disk_is_said_and_costs_the_current_frame_only(tmp_path):
 def test_what_fails_at_the_end_does_not_lose_the_rest(tmp_path, turning_sphere, monkeypatch, start_run):
     writer = start_run(tmp_path, turning_sphere)
     writer.write(turning_sphere.estimates[0], turning_sphere.frames[0])
-    monkeypatch.setattr("tracking3d.results.mesh_export.export_glb", failing(errno.ENOSPC))
+    monkeypatch.setattr("trimesh.exchange.gltf.export_glb", failing(errno.ENOSPC))
     with pytest.raises(OSError, match="No space"):
         writer.finish(turning_sphere.model, "finished")
     run = RunReader(tmp_path)

@@ -12,6 +12,7 @@ from tracking3d.reconstruction.grid import FloatArray, Grid
 
 _SAMPLES = 20_000
 _NEAREST = 2  # samples whose faces are asked for the exact distance
+_POINTS_AT_ONCE = 10_000  # so that what trimesh computes with them stays small
 
 
 def mesh_distance(
@@ -35,11 +36,14 @@ def mesh_distance(
     )
     distance = np.full(len(points), far)
     found = np.isfinite(rough).all(1)
-    near, nearest = around[found], nearest[found]
-    corners = mesh.triangles[of_face[nearest].ravel()]
-    closest = trimesh.triangles.closest_point(corners, np.repeat(points[near], _NEAREST, axis=0))
-    exact = np.linalg.norm(closest.reshape(-1, _NEAREST, 3) - points[near, None], axis=2).min(1)
-    distance[near] = np.minimum(exact, far)
+    around, faces_there = around[found], of_face[nearest[found]]
+    for first in range(0, len(around), _POINTS_AT_ONCE):
+        some = slice(first, first + _POINTS_AT_ONCE)
+        near = points[around[some]]
+        corners = mesh.triangles[faces_there[some].ravel()]
+        closest = trimesh.triangles.closest_point(corners, np.repeat(near, _NEAREST, axis=0))
+        exact = np.linalg.norm(closest.reshape(-1, _NEAREST, 3) - near[:, None], axis=2).min(1)
+        distance[around[some]] = np.minimum(exact, far)
     return np.where(inside_mesh(grid, vertices, faces), distance, -distance).astype(np.float32)
 
 

@@ -26,6 +26,7 @@ from tracking3d.runtime.progress import report_each, report_progress
 _SMALLEST = 64
 _STEEPNESS = 3
 """Power of the weights, which are the squared cosine of the viewing angle already."""
+_ROWS_AT_ONCE = 64  # of a texture, so that what is computed with them is small
 _COARSE = 4  # times fewer texels along a side for exposures and votes
 _EXPOSURE = 1.25  # factor up to which a view may be brighter or darker than the others
 _VOTED_DOWN = 0.12  # difference of colours, in [0, 1], at which a view loses most of its say
@@ -66,13 +67,16 @@ def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) 
         add_view(total, weight, _seen(model, texels, view), gain, expected, view.sharpness / sharpest)
     if not weight.any():
         return model
-    texture = fill_holes(
-        _divide_safely(total, weight).reshape(size, size, 3), (weight > 0).reshape(size, size)
-    )
+    texel = texels.texel.numpy()
+    del texels, expected  # a large texture takes 50 MB
+    np.divide(total, np.maximum(weight, 1e-20)[:, None], out=total)
+    texture = fill_holes(total.reshape(size, size, 3), (weight > 0).reshape(size, size))
+    del total
+    np.clip(np.round(np.multiply(texture, 255, out=texture), out=texture), 0, 255, out=texture)
     return replace(
         model,
-        texture=np.clip(np.round(255 * texture), 0, 255).astype(np.uint8),
-        texture_weight=continue_charts(weight.reshape(size, size), texels.texel.numpy()),
+        texture=texture.astype(np.uint8),
+        texture_weight=continue_charts(weight.reshape(size, size), texel),
     )
 
 
@@ -116,14 +120,18 @@ def fill_holes(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     # Mean over blocks of what is known, filled itself, and back: push and pull.
     half = (math.ceil(width / 2), math.ceil(height / 2))
     share = cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(texture * known[..., None].astype(np.float32), half, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(texture * known[..., None], half, interpolation=cv2.INTER_AREA)
     coarse = fill_holes(mean / np.maximum(share, 1e-6)[..., None], share > 0)
     wrapped = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], 1)
     columns = (np.arange(width, dtype=np.float32) + 0.5) * half[0] / width - 0.5 + 1
     rows = (np.arange(height, dtype=np.float32) + 0.5) * half[1] / height - 0.5
-    x, y = np.meshgrid(columns, rows)
-    beyond = cv2.remap(wrapped, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(known[..., None], texture, beyond).astype(np.float32)
+    filled = texture.copy()
+    for first in range(0, height, _ROWS_AT_ONCE):
+        strip = slice(first, first + _ROWS_AT_ONCE)
+        x, y = np.meshgrid(columns, rows[strip])
+        beyond = cv2.remap(wrapped, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        np.copyto(filled[strip], beyond, where=~known[strip, :, None])
+    return filled
 
 
 def continue_charts(values: FloatArray, texel: NDArray[np.int64]) -> FloatArray:

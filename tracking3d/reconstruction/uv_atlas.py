@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -58,6 +59,8 @@ def _transfer_texture(
     size: int,
 ) -> NDArray:
     """A texture ``(size, size, C)`` of the new surface from ``(T, T, C)`` of the old: from the nearest texel."""
+    if len(values) > size:
+        values = cv2.resize(values, (size, size), interpolation=cv2.INTER_AREA)
     old_texel, old_points = _texel_points(model.vertices, model.faces, model.face_uvs, len(values))
     texel, points = _texel_points(vertices, faces, face_uvs, size)
     _, nearest = cKDTree(old_points).query(points, eps=0.2)

@@ -22,6 +22,7 @@ _DEPTH_TOLERANCE = 0.02
 """A texel is hidden if something is nearer by more than this share of the mesh's radius."""
 _GRAZING = 0.15
 """Texels seen at a smaller cosine are ignored: the outline is uncertain by a pixel or so."""
+_TEXELS_AT_ONCE = 1 << 16  # a large atlas has millions, and what is computed with them is ten times as large
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,13 @@ class TexelMap:
         index = rasterize(flat, torch.ones_like(flat[..., 0]), triangles, (size, size)).face_index.reshape(-1)
         texel = torch.nonzero(index >= 0)[:, 0]
         drawn = index[texel]
-        x, y = (texel % size).to(corner), torch.div(texel, size, rounding_mode="floor").to(corner)
-        corner_x, corner_y = both[drawn].permute(2, 1, 0)
-        weights, _, _ = barycentrics(corner_x, corner_y, x, y)
+        del index
+        weights = corner.new_empty(3, len(texel))
+        for first in range(0, len(texel), _TEXELS_AT_ONCE):
+            some = slice(first, first + _TEXELS_AT_ONCE)
+            x, y = texel[some] % size, torch.div(texel[some], size, rounding_mode="floor")
+            corner_x, corner_y = both[drawn[some]].permute(2, 1, 0)
+            weights[:, some], _, _ = barycentrics(corner_x, corner_y, x.to(corner), y.to(corner))
         return cls(size, texel, drawn % count, weights.T)
 
 

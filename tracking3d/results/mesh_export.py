@@ -300,6 +300,8 @@ def restore_texture(folder: Path) -> bool:
     Raises:
         OutputError: If it cannot be written.
     """
+    import trimesh  # slow to import
+
     path = folder / TEXTURE
     if (path.is_file() and path.stat().st_size) or not (folder / GLB).is_file():
         return False

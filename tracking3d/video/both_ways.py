@@ -13,7 +13,7 @@ from tracking3d.frames import Frame, SkippedFrame
 START_FRAME = argument("start_frame=", "--start-frame ")
 """Name in messages of the start frame, before its number."""
 _OPTION = argument("start_frame=", "--start-frame")
-MOST_BYTES = 512 << 20
+MOST_BYTES = 256 << 20
 """Memory in bytes for frames that are played backwards; a longer beginning is read more than once."""
 
 Item = Frame | SkippedFrame
