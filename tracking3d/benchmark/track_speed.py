@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -115,9 +116,10 @@ def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -
     box = ",".join(f"{side:g}" for side in truth.box_in_frame() or ())
     some = ["--frames", f":{frames}"] if frames else []
     command = [
-        "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--overwrite", "--no-report", "--quiet",
-        *some, *contender.settings,
+        "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--no-report", "--quiet", *some,
+        *contender.settings,
     ]  # fmt: skip
+    shutil.rmtree(folder, ignore_errors=True)  # another version would have to be able to read it
     before, started = _processor(), time.perf_counter()
     done = _python(contender, "tracking3d", *command)
     wall, after = time.perf_counter() - started, _processor()
