@@ -14,6 +14,7 @@ from tracking3d.reconstruction.grid import Grid
 from tracking3d.reconstruction.mesh_distance import mesh_distance
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps, patch_scores
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
+from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
 from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
 from tracking3d.reconstruction.visual_hull import carve_hull
 
@@ -74,6 +75,41 @@ def test_the_distance_of_a_mesh_is_exact_and_signed():
     expected = 1 - np.linalg.norm(grid.points, axis=1)
     assert np.abs(distance - np.clip(expected, -0.5, 0.5)).max() < 0.04  # flat faces lie within the ball
     assert ((distance > 0) == (expected > 0))[np.abs(expected) > 0.04].all()
+
+
+def test_a_part_that_is_turned_inside_out_has_an_inside():
+    mesh = sphere(6)
+    grid = Grid.around(mesh.vertices, 16, 0.2)
+    outward = mesh_distance(grid, mesh.vertices, mesh.faces, 0.5)
+    np.testing.assert_array_equal(
+        mesh_distance(grid, mesh.vertices, mesh.faces[:, ::-1], 0.5) > 0, outward > 0
+    )
+
+
+def test_a_shape_grows_where_views_show_the_object_beside_it(around):
+    mesh = sphere(6)
+    grid = Grid.around(mesh.vertices, 24, 0.2)
+    hull, _ = carve_hull(grid.points, around, 0.4)
+    ball = mesh_distance(grid, mesh.vertices, mesh.faces, 0.5)
+    half = np.minimum(ball, grid.points[:, 1] + 0.2)  # what is below a plane is missing
+    restored = restore_uncovered(grid, hull, half, around)
+    assert (half[ball > 0.1] > 0).mean() < 0.7
+    assert (restored[ball > 0.1] > 0).mean() > 0.9
+    assert not (restored[hull <= 0] > 0).any()
+
+
+def test_a_shape_that_covers_the_object_stays_as_it_is(around):
+    mesh = sphere(6)
+    grid = Grid.around(mesh.vertices, 24, 0.2)
+    hull, _ = carve_hull(grid.points, around, 0.4)
+    ball = mesh_distance(grid, mesh.vertices, mesh.faces, 0.5)
+    np.testing.assert_array_equal(restore_uncovered(grid, hull, ball, around), ball)
+
+
+def test_where_there_is_no_shape_the_hull_takes_its_place(around):
+    grid = Grid.around(sphere(6).vertices, 12, 0.2)
+    hull, _ = carve_hull(grid.points, around, 0.4)
+    np.testing.assert_array_equal(restore_uncovered(grid, hull, np.full_like(hull, -1), around), hull)
 
 
 def test_patches_find_the_depth_of_a_ball():

@@ -61,6 +61,8 @@ def _cells_around(grid: Grid, samples: NDArray[np.float64], far: float) -> NDArr
 def inside_mesh(grid: Grid, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
     """``(X * Y * Z,)`` whether voxels are inside a closed mesh: the surface is crossed inwards on the way along z.
 
+    A part that is turned inside out, as a deformed sphere may have them, has an inside, too.
+
     Args:
         grid: Where.
         vertices: ``(V, 3)``.
@@ -90,4 +92,4 @@ def inside_mesh(grid: Grid, vertices: NDArray[np.float64], faces: NDArray[np.int
     from_there = np.clip(np.ceil(z), 0, grid.shape[2]).astype(int)
     # A face that is counter-clockwise seen from above has its outside above: below it one is inside.
     np.add.at(crossings, (x[hit].astype(int), y[hit].astype(int), from_there), -np.sign(area[hit]))
-    return np.asarray(crossings.cumsum(2)[..., :-1] > 0.5).ravel()
+    return np.asarray(np.abs(crossings.cumsum(2)[..., :-1]) > 0.5).ravel()

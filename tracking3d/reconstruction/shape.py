@@ -29,6 +29,7 @@ from tracking3d.reconstruction.meshing import (
 )
 from tracking3d.reconstruction.plane_sweep import Guide, depth_maps
 from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
+from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
 from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
 from tracking3d.reconstruction.visual_hull import carve_hull
 from tracking3d.runtime.progress import report_progress
@@ -118,13 +119,15 @@ def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, F
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
     bounds = {}
+    references = spread_by_rotation(views, _REFERENCES_APART, _REFERENCES)
     for cells in (_COARSE, _CELLS):
         grid = Grid.around(vertices, cells, _MARGIN)
         hull, _ = carve_hull(grid.points, views, 2 * truncation)
-        bounds[cells] = grid, hull, mesh_distance(grid, vertices, faces, 1.2 * truncation)
+        prior = mesh_distance(grid, vertices, faces, 1.2 * truncation)
+        bounds[cells] = grid, hull, restore_uncovered(grid, hull, prior, references)
     maps = depth_maps(
         views,
-        spread_by_rotation(views, _REFERENCES_APART, _REFERENCES),
+        references,
         _guide(*bounds[_COARSE], start),
         _REACH * diagonal,
         _STEPS,
