@@ -29,7 +29,7 @@ def turned(view, degrees: float):
 def test_too_little_is_said_and_the_shape_stays(yaws, words):
     model = ball()
     views = shape_views(yaws)
-    made = reconstruct_shape(model.vertices, model.faces, views, views[:1])
+    made = reconstruct_shape([(model.vertices, model.faces)], views, views[:1])
     assert made.vertices is None and words in made.sentence
 
 

@@ -114,7 +114,7 @@ def sheet_of(run: Path) -> np.ndarray:
 def new_shape(monkeypatch) -> None:
     """Let the reconstruction find a sphere of half the size."""
     made = ReconstructedShape(ball().vertices * 0.5, ball().faces, "it is better", None, None)
-    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda vertices, faces, views, left_out: made)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda starts, views, left_out: made)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monk
     run = written(tmp_path)
     before, smaller = load_model(run), ball().vertices * 0.97
     made = ReconstructedShape(smaller, ball().faces, "it is better", None, None)
-    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda vertices, faces, views, left_out: made)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda starts, views, left_out: made)
     shaped = rebuild_shape(run)
     after = load_model(run)
     assert shaped.new and shaped.views == len(YAWS)
@@ -202,7 +202,7 @@ def test_without_a_texture_from_the_video_the_online_mesh_comes_back_as_it_was(t
     assert result.exit_code == 0 and "stays as it is" in result.output
     assert {path: path.read_bytes() for path in files} == files
     made = ReconstructedShape(ball().vertices * 0.97, ball().faces, "it is better", None, None)
-    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda vertices, faces, views, left_out: made)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda starts, views, left_out: made)
     before = load_model(run)
     rebuild_shape(run)
     result = CliRunner().invoke(app, ["model", str(run), "--model", "none"])

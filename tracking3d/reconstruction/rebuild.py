@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,12 +11,12 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.frames import Frame
 from tracking3d.reconstruction.held_out_scores import HeldOutScores, held_out_scores
 from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
 from tracking3d.reconstruction.reliable_frames import no_reliable_frame_error, reliable_frames
+from tracking3d.reconstruction.run_views import RunViews, collect_views, views_of_frame
 from tracking3d.reconstruction.shape import MOST, reconstruct_shape
-from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
+from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.texturing import bake_texture
 from tracking3d.reconstruction.unseen_closing import close_unseen
 from tracking3d.reconstruction.uv_atlas import replace_shape
@@ -23,7 +24,6 @@ from tracking3d.reconstruction.views import TextureView, keep_best_views, textur
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.records import FrameRecord
 from tracking3d.results.redrawing import redraw_contact_sheet
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
@@ -70,7 +70,7 @@ def retexture_run(
         OutputError: If the mesh cannot be written.
     """
     run = RunReader(folder)
-    model = _online_model(run)
+    model = online_model(run)
     views: tuple[TextureView, ...] = ()
     for frame, record in reliable_frames(run, source):
         mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
@@ -103,39 +103,47 @@ def rebuild_shape(
     """
     check_packages()
     run = RunReader(folder)
-    online = _online_model(run)
-    shapes: list[ShapeView] = []
-    left_out: list[ShapeView] = []
-    count = 0
-    views: tuple[TextureView, ...] = ()
-    for frame, record in reliable_frames(run, source):
-        seen = _views_of_frame(run, frame, record)
-        if seen is None:
-            continue
-        views = keep_best_views(views, seen[1], most)
-        (left_out if is_held_out(count) else shapes).append(seen[0])
-        count += 1
-        if len(shapes) > 4 * MOST:  # memory does not grow with the video
-            shapes = spread_by_rotation(shapes, 0.5, 2 * MOST)
-        if len(left_out) > 2 * MOST_LEFT_OUT:
-            left_out = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
-    if not views:
+    online = online_model(run)
+    return reshape_run(run, online, collect_views(run, source, most), largest)
+
+
+def reshape_run(
+    run: RunReader,
+    online: ObjectModel,
+    views: RunViews,
+    largest: int,
+    others: Sequence[ObjectModel] = (),
+) -> ShapedRun:
+    """Reconstruct the shape of a run's object from views, and write the mesh if that explains them better.
+
+    Args:
+        run: The run.
+        online: Its object, with the mesh of the online map.
+        views: Frames with poses of that object.
+        largest: Most texels along a side.
+        others: The same object as other videos know it, in its coordinates.
+
+    Raises:
+        InputError: If there is no reliable frame.
+        OutputError: If the mesh cannot be written.
+    """
+    if not views.textures:
         raise no_reliable_frame_error(run)
-    judges = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
-    made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
+    starts = [(one.vertices, one.faces) for one in (online, *others)]
+    made = reconstruct_shape(starts, views.shapes, views.left_out)
     if made.vertices is None or made.faces is None:
-        model = close_unseen(bake_texture(online, views, largest))
+        model = close_unseen(bake_texture(online, views.textures, largest))
         _replace_mesh(run, model)
-        return ShapedRun(model, len(views), False, made.sentence)
+        return ShapedRun(model, len(views.textures), False, made.sentence)
     report_progress("unwrapping the surface")
-    made_model = replace_shape(online, made.vertices, made.faces, shapes)
-    model = close_unseen(bake_texture(made_model, views, largest))
+    made_model = replace_shape(online, made.vertices, made.faces, views.shapes)
+    model = close_unseen(bake_texture(made_model, views.textures, largest))
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
         export_mesh(kept, online, run.unit)
     _replace_mesh(run, model)
-    return ShapedRun(model, len(views), True, made.sentence)
+    return ShapedRun(model, len(views.textures), True, made.sentence)
 
 
 def restore_online_mesh(folder: Path) -> bool:
@@ -149,7 +157,7 @@ def restore_online_mesh(folder: Path) -> bool:
         OutputError: If the mesh cannot be written.
     """
     run = RunReader(folder)
-    model = _online_model(run)
+    model = online_model(run)
     if not (run.mesh_folder / layout.ONLINE / layout.FEATURES).is_file():
         return False
     _replace_mesh(run, model)
@@ -179,7 +187,7 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
     views: tuple[TextureView, ...] = ()
     count = 0
     for frame, record in reliable_frames(run, source):
-        if (seen := _views_of_frame(run, frame, record)) is None:
+        if (seen := views_of_frame(run, frame, record)) is None:
             continue
         if is_held_out(count):
             left_out.append(seen)
@@ -196,16 +204,6 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
             f"Only {count} frames of the run {folder} are reliable; none can be held out to test its model."
         )
     return held_out_scores(bake_texture(model, views, largest), used, left_out)
-
-
-def _views_of_frame(
-    run: RunReader, frame: Frame, record: FrameRecord
-) -> tuple[ShapeView, TextureView] | None:
-    """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
-    pose = run.camera_of(record), np.asarray(record.T_cam_obj)
-    shape = shape_view(frame.index, frame.image, run.pinhole_mask(frame.index), *pose)
-    view = texture_view(frame.index, frame.image, run.visible_pinhole_mask(frame.index), *pose)
-    return None if shape is None or view is None else (shape, view)
 
 
 def has_packages() -> bool:
@@ -236,6 +234,11 @@ def _replace_mesh(run: RunReader, model: ObjectModel) -> None:
         redraw_contact_sheet(RunReader(run.folder))
 
 
-def _online_model(run: RunReader) -> ObjectModel:
+def online_model(run: RunReader) -> ObjectModel:
+    """The object of a run with the mesh of its online map, whatever the final mesh is.
+
+    Raises:
+        InputError: If there is none.
+    """
     kept = run.mesh_folder / layout.ONLINE
     return load_model(kept if (kept / layout.FEATURES).is_file() else run.mesh_folder)

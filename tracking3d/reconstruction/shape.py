@@ -72,16 +72,15 @@ class ReconstructedShape:
 
 
 def reconstruct_shape(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
+    starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
     views: Sequence[ShapeView],
     left_out: Sequence[ShapeView],
 ) -> ReconstructedShape:
     """Make a shape that explains frames better than the one at hand.
 
     Args:
-        vertices: ``(V, 3)`` of the shape at hand, closed.
-        faces: ``(F, 3)``.
+        starts: Vertices ``(V, 3)`` and faces ``(F, 3)`` of the shape at hand, closed; and of others of the same object,
+            which other videos have shown.
         views: The frames that it is made from, in order.
         left_out: The frames that it is judged by, see `is_held_out`.
     """
@@ -91,8 +90,8 @@ def reconstruct_shape(
     if (turn := largest_turn(np.stack([view.T_cam_obj[:3, :3] for view in used]))) < LEAST_TURN:
         return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
     report_progress("carving the hull")
-    start = trimesh.Trimesh(vertices, faces, process=False)
-    grid, inside = _volume(start, used)
+    vertices, faces = starts[0]
+    grid, inside = _volume(starts, used)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
     if mesh is None:
@@ -113,9 +112,11 @@ def reconstruct_shape(
     return ReconstructedShape(new_vertices, new_faces, comparison, old, new)
 
 
-def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, FloatArray]:
+def _volume(
+    starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], views: Sequence[ShapeView]
+) -> tuple[Grid, FloatArray]:
     """All evidence in a volume, positive inside."""
-    vertices, faces = np.asarray(start.vertices), np.asarray(start.faces)
+    vertices = np.concatenate([points for points, _ in starts])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
     bounds = {}
@@ -123,12 +124,13 @@ def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, F
     for cells in (_COARSE, _CELLS):
         grid = Grid.around(vertices, cells, _MARGIN)
         hull, _ = carve_hull(grid.points, views, 2 * truncation)
-        prior = mesh_distance(grid, vertices, faces, 1.2 * truncation)
+        distances = [mesh_distance(grid, points, faces, 1.2 * truncation) for points, faces in starts]
+        prior = np.maximum.reduce(distances)  # what one video has not shown is often missing from its shape
         bounds[cells] = grid, hull, restore_uncovered(grid, hull, prior, references)
     maps = depth_maps(
         views,
         references,
-        _guide(*bounds[_COARSE], start),
+        _guide(*bounds[_COARSE], *starts[0]),
         _REACH * diagonal,
         _STEPS,
     )
@@ -137,10 +139,18 @@ def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, F
     return grid, fuse_depth(grid.shape, hull, prior, total, weight, truncation)
 
 
-def _guide(grid: Grid, hull: FloatArray, prior: FloatArray, start: trimesh.Trimesh) -> Guide:
+def _guide(
+    grid: Grid,
+    hull: FloatArray,
+    prior: FloatArray,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+) -> Guide:
     """The mesh of the online map as far as it is within the hull: where depths are looked for."""
     found = extract_surface(grid, np.minimum(hull, prior))
-    mesh = start if found is None else decimate_roughly(main_pieces(found), _GUIDE_FACES)
+    if found is None:
+        return Guide(vertices, faces)
+    mesh = decimate_roughly(main_pieces(found), _GUIDE_FACES)
     return Guide(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
 
 
