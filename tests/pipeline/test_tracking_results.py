@@ -147,7 +147,8 @@ def test_a_size_that_is_none_is_refused_at_once(clip, config):
 def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip, config, monkeypatch):
     given: list[int] = []
 
-    def smaller(vertices, faces, views, left_out):
+    def smaller(starts, views, left_out):
+        [(vertices, faces)] = starts
         given.extend(view.index for view in (*views, *left_out))
         return ReconstructedShape(vertices * 0.9, faces, "It is better.", None, None)
 

@@ -31,6 +31,12 @@ def model(
     run: Run,
     model: Annotated[str, model_option()] = "fast",
     quality: Annotated[str | None, typer.Option(hidden=True, callback=_refuse_quality)] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN", help="An earlier run of the same object, whose frames make the model too."
+        ),
+    ] = None,
     object_size: ObjectSize = None,
     source: Video = None,
     views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
@@ -40,7 +46,8 @@ def model(
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --model fine reconstruct its shape too.
 
-    `tracking3d run` does this at its end, with the same option --model. The run's contact sheet, report and turntable
+    `tracking3d run` does this at its end, with the same option --model. With --extend the frames of an earlier run of
+    the same object make shape and texture, too. The run's contact sheet, report and turntable
     are made again, if it has them.
     """
     from tracking3d.results.layout import check_run_folder
@@ -51,7 +58,11 @@ def model(
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
     from tracking3d.report.renewal import renew_report
 
-    outcome = _make_mesh(run, model, source, views, largest, quiet)
+    if extend is None:
+        outcome = _make_mesh(run, model, source, views, largest, quiet)
+    else:
+        check_run_folder(extend)
+        outcome = _extend_mesh(run, extend, source, views, largest, quiet)
     if object_size is not None:
         from tracking3d.results.run_unit import scale_run
 
@@ -93,6 +104,26 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
             made, taken = retexture_run(run, source, views, largest)
     size = len(made.texture)
     return [*outcome, f"{run}: texture of {size} x {size} texels from {taken} frames"]
+
+
+def _extend_mesh(
+    run: Path, earlier: Path, source: str | None, views: int, largest: int, quiet: bool
+) -> list[str]:
+    """Make the mesh of a run with the frames of an earlier one, and return what to print about it."""
+    from tracking3d.cli.plans import plan_shape
+    from tracking3d.cli.progress import show_progress
+    from tracking3d.reconstruction.extension import extend_run
+    from tracking3d.results.run_notes import note_in_run
+    from tracking3d.results.run_reader import RunReader
+
+    with show_progress(quiet, plan_shape(len(RunReader(run).frames) + len(RunReader(earlier).frames))):
+        extended = extend_run(run, earlier, source, views, largest)
+    note_in_run(run, {"shape": extended.sentence})
+    made = extended.shaped.model
+    return [
+        f"{run}: {len(made.faces)} faces; {extended.sentence}",
+        f"{run}: texture of {len(made.texture)} x {len(made.texture)} texels from {extended.shaped.views} frames",
+    ]
 
 
 def check_model_source(model: str | None, source: str) -> None:

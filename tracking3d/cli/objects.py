@@ -75,6 +75,10 @@ def check_files(prompt: PromptOptions, prototype: str | None) -> None:
         raise InputError(
             f"--object {prompt.known} does not exist; give the folder of an earlier run, or a mesh file."
         )
+    if prompt.extend and (prompt.known is None or not Path(prompt.known).expanduser().is_dir()):
+        raise InputError(
+            "--extend needs the folder of an earlier run of the same object: give it by --object RUN."
+        )
     if prototype not in (None, "sphere", "ellipsoid") and not Path(str(prototype)).exists():
         raise InputError(
             f"The prototype '{prototype}' does not exist; give sphere, ellipsoid or a mesh file."
@@ -96,3 +100,22 @@ def check_known(settings: PipelineConfig, objects: int, split: bool) -> None:
         raise InputError(
             "--split merges parts that each reconstruct the object; leave out --split, or --object."
         )
+
+
+def check_extended(settings: PipelineConfig, objects: int, split: bool) -> None:
+    """Make sure that the other options go with ``--extend``, and that the earlier run has a model.
+
+    Raises:
+        InputError: One of them does not, or it has none.
+    """
+    if settings.object.extends is None:
+        return
+    from tracking3d.pipeline.known_object import read_known_object
+    from tracking3d.reconstruction.rebuild import check_packages
+
+    if objects > 1 or split:
+        raise InputError(
+            "--extend makes one model of one object; give one box or mask, and leave out --split."
+        )
+    check_packages()
+    read_known_object(Path(settings.object.extends))

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 import typer
 
 from tracking3d.cli.model import check_model_source
-from tracking3d.cli.objects import check_files, check_known, parse_given_box, parse_given_masks
+from tracking3d.cli.objects import (
+    check_extended,
+    check_files,
+    check_known,
+    parse_given_box,
+    parse_given_masks,
+)
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.camera import CameraOptions
 from tracking3d.cli.options.output import OutputOptions
@@ -62,7 +68,7 @@ def run(
     check_source_name(source)
     validate_fps(video.fps)
     check_files(prompt, tracking.prototype)
-    if prompt.known is not None and output.object_size is not None:
+    if prompt.known is not None and not prompt.extend and output.object_size is not None:
         raise InputError("A known object has its own unit; leave out --object-size, or --object.")
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
@@ -71,6 +77,7 @@ def run(
     check_model_source(settings.model, source)
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), performance.split is not None)
+    check_extended(config, len(prompts), performance.split is not None)
     if not prompts and needs_prompt(config):
         if not a_person_is_there() or quiet or output.resume or source.isdigit():
             raise InputError(
@@ -107,7 +114,8 @@ def _configure(
         features=tracking.features,
         camera=camera.settings(),
         object={
-            "model": prompt.known,
+            "model": None if prompt.extend else prompt.known,
+            "extends": prompt.known if prompt.extend else None,
             "flat": tracking.flat or None,
             "trust_masks": tracking.trust_masks or None,
             "prototype": tracking.prototype,

@@ -101,6 +101,13 @@ class ObjectConfig(Section):
             "fast, and prototype is ignored."
         ),
     )
+    extends: str | None = Field(
+        None,
+        description=(
+            "The folder of an earlier run of the same object: at the end of this run the frames of both videos make "
+            "its mesh, with the sides that each of them shows."
+        ),
+    )
     prototype: str = Field(
         "ellipsoid", description="Initial shape: sphere, ellipsoid (fitted to the first mask) or a mesh file."
     )
@@ -182,6 +189,10 @@ class ObjectConfig(Section):
     def _has_one_unit(self) -> ObjectConfig:
         if self.model is not None and self.size is not None:
             raise ValueError("a known object has its own unit; leave out size, or model")
+        if self.model is not None and self.extends is not None:
+            raise ValueError(
+                "the shape of a known object is fixed and cannot be extended; leave out extends, or model"
+            )
         return self
 
     @model_validator(mode="before")

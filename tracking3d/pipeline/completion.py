@@ -53,7 +53,8 @@ def complete_run(folder: Path, config: PipelineConfig, source: FrameSource) -> N
         OutputError: If something cannot be written.
     """
     missing = missing_files(folder, (*layout.MESH_FILES, *PICTURES))
-    shapeless = config.object.shape == "fine" and "shape" not in RunReader(folder).description
+    wanted = config.object.shape == "fine" or config.object.extends is not None
+    shapeless = wanted and "shape" not in RunReader(folder).description
     if missing or shapeless:
         names = [*missing, *(["the shape from all frames"] if shapeless else [])]
         _log.warning(_MADE_AGAIN, folder, ", ".join(names))

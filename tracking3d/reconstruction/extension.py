@@ -42,6 +42,15 @@ class ExtendedRun:
     shaped: ShapedRun
     registration: Registration
 
+    @property
+    def sentence(self) -> str:
+        """What came of it, in a sentence."""
+        found = self.registration
+        return (
+            f"{found.matches} matched keypoints in {found.pairs} pairs of frames tell how the earlier object lies in "
+            f"this one; {self.shaped.sentence}"
+        )
+
 
 def extend_run(
     folder: Path,
@@ -85,9 +94,9 @@ def extend_run(
         [view for part in parts for view in part.left_out],
         tuple(view for part in parts for view in part.textures),
     )
-    shaped = reshape_run(run, close_unseen(online), together, largest, models)
-    note = {"run": str(earlier.resolve()), **_describe(registration)}
-    note_in_run(folder, {NOTE: note})
+    shaped = reshape_run(run, close_unseen(online), together, largest, models, own.textures)
+    if shaped.new:
+        note_in_run(folder, {NOTE: {"run": str(earlier.resolve()), **_describe(registration)}})
     return ExtendedRun(shaped, registration)
 
 

@@ -38,7 +38,8 @@ def can_reconstruct(folder: Path, config: PipelineConfig, source: FrameSource) -
 def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, always: bool = False) -> str:
     """Reconstruct the shape of a finished run if ``object.shape`` asks for it; if that is not possible, the mesh stays.
 
-    What came of it stands in ``run.json`` under ``shape`` too. With ``auto`` nothing is said if it is not possible.
+    With ``object.extends`` the frames of an earlier run make the mesh, too. What came of it stands in ``run.json`` as
+    well, under ``shape``. With ``auto`` nothing is said if it is not possible.
 
     Args:
         folder: The run folder.
@@ -52,6 +53,10 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
     Raises:
         OutputError: If something cannot be written.
     """
+    if config.object.extends is not None:
+        sentence = _extend(folder, Path(config.object.extends), source)
+        note_in_run(folder, {"shape": sentence})
+        return sentence
     from tracking3d.reconstruction.rebuild import rebuild_shape  # slow to import, and only needed at the end
 
     wanted = config.object.shape == "fine" or always
@@ -68,3 +73,21 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
         )
     note_in_run(folder, {"shape": sentence})
     return sentence
+
+
+def _extend(folder: Path, earlier: Path, source: FrameSource) -> str:
+    """Make the model from a run's frames and an earlier run's; what came of it, in a sentence."""
+    from tracking3d.reconstruction.extension import extend_run  # slow to import, and only needed at the end
+    from tracking3d.reconstruction.rebuild import rebuild_shape
+
+    if not source.repeatable:
+        return f"The model is not extended, for {source.name} comes once only and all frames are needed a second time."
+    try:
+        extended = extend_run(folder, earlier, source)
+    except InputError as error:
+        reason = str(error)
+        try:
+            return f"{reason} The mesh shows this video alone: {rebuild_shape(folder, source).sentence}"
+        except InputError:
+            return reason
+    return extended.sentence

@@ -113,6 +113,7 @@ def reshape_run(
     views: RunViews,
     largest: int,
     others: Sequence[ObjectModel] = (),
+    own_textures: tuple[TextureView, ...] | None = None,
 ) -> ShapedRun:
     """Reconstruct the shape of a run's object from views, and write the mesh if that explains them better.
 
@@ -122,6 +123,7 @@ def reshape_run(
         views: Frames with poses of that object.
         largest: Most texels along a side.
         others: The same object as other videos know it, in its coordinates.
+        own_textures: The frames that the texture is taken from if the shape stays; None for all of the views.
 
     Raises:
         InputError: If there is no reliable frame.
@@ -132,9 +134,10 @@ def reshape_run(
     starts = [(one.vertices, one.faces) for one in (online, *others)]
     made = reconstruct_shape(starts, views.shapes, views.left_out)
     if made.vertices is None or made.faces is None:
-        model = close_unseen(bake_texture(online, views.textures, largest))
+        textures = views.textures if own_textures is None else own_textures
+        model = close_unseen(bake_texture(online, textures, largest))
         _replace_mesh(run, model)
-        return ShapedRun(model, len(views.textures), False, made.sentence)
+        return ShapedRun(model, len(textures), False, made.sentence)
     report_progress("unwrapping the surface")
     made_model = replace_shape(online, made.vertices, made.faces, views.shapes)
     model = close_unseen(bake_texture(made_model, views.textures, largest))

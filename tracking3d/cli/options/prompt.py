@@ -62,6 +62,14 @@ KnownObject = Annotated[
         rich_help_panel=PROMPT,
     ),
 ]
+Extend = Annotated[
+    bool,
+    typer.Option(
+        "--extend",
+        help="Track the object by itself, and make its model from this video and that of --object RUN.",
+        rich_help_panel=PROMPT,
+    ),
+]
 StartFrame = Annotated[
     int | None,
     typer.Option(
@@ -90,6 +98,7 @@ class PromptOptions:
     points: Points = None
     masks: Masks = None
     known: KnownObject = None
+    extend: Extend = False
     start_frame: StartFrame = None
     correct: Correct = None
 
