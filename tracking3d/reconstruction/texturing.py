@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.reconstruction.seen_regions import select_seen_texels, spread_colours
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
 from tracking3d.rendering.backend import give_threads, threads_kept
@@ -67,10 +68,19 @@ def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) 
         add_view(total, weight, _seen(model, texels, view), gain, expected, view.sharpness / sharpest)
     if not weight.any():
         return model
-    texel = texels.texel.numpy()
-    del texels, expected  # a large texture takes 50 MB
+    texel, face, barycentric = (part.numpy() for part in (texels.texel, texels.face, texels.barycentric))
+    del expected  # a large texture takes 50 MB
     np.divide(total, np.maximum(weight, 1e-20)[:, None], out=total)
-    texture = fill_holes(total.reshape(size, size, 3), (weight > 0).reshape(size, size))
+    shown = weight[texel] > 0
+    surface = model.vertices, model.faces, face
+    total[texel[~shown]] = spread_colours(*surface, barycentric, total[texel], shown)
+    seen = select_seen_texels(*surface, shown)
+    weight[texel] = np.where(seen, np.maximum(weight[texel], weight[weight > 0].min()), 0)
+    if not seen.any():
+        return model
+    on_surface = np.zeros(size * size, bool)
+    on_surface[texel] = True
+    texture = fill_holes(total.reshape(size, size, 3), on_surface.reshape(size, size))
     del total
     np.clip(np.round(np.multiply(texture, 255, out=texture), out=texture), 0, 255, out=texture)
     return replace(

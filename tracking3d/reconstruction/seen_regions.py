@@ -1,0 +1,130 @@
+"""What was seen of a surface as whole regions, and colours for the rest, carried over the surface.
+
+At grazing angles views show single texels and miss those between them. Such a face is told by its neighbours: whether
+it counts as seen is averaged over the surface, so that the border of what was seen is a line and not a spray of specks.
+Colours that no view shows are those of a membrane over the surface, fixed where colours are known: they continue what
+is next to them on the object, not what happens to lie beside it in the atlas.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import spsolve
+
+FloatArray = NDArray[np.float32]
+_ROUNDS = 6  # of averaging over adjacent faces
+_SEEN = 0.5  # share of a region's texels
+_TEXELS_AT_ONCE = 1 << 16
+
+
+def smooth_seen_share(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The share ``(F,)`` of each face that was seen, averaged over the faces around it, each counting by its area.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        share: ``(F,)`` in [0, 1].
+    """
+    corners = vertices[faces]
+    area = (
+        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-12
+    )
+    adjacent = _adjacent_faces(faces)
+    around = area + adjacent @ area
+    for _ in range(_ROUNDS):
+        share = (area * share + adjacent @ (area * share)) / around
+    return share
+
+
+def select_seen_texels(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    face: NDArray[np.int64],
+    shown: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """``(N,)`` which texels count as seen: all or none of a face.
+
+    Args:
+        vertices: ``(V, 3)``; faces: ``(F, 3)``.
+        faces: See ``vertices``.
+        face: ``(N,)`` the face of each texel on the surface.
+        shown: ``(N,)`` whether a view shows it.
+    """
+    count = np.bincount(face, minlength=len(faces))
+    share = np.bincount(face, shown, minlength=len(faces)) / np.maximum(count, 1)
+    return np.asarray((smooth_seen_share(vertices, faces, share) > _SEEN)[face])
+
+
+def spread_colours(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    face: NDArray[np.int64],
+    barycentric: FloatArray,
+    colours: FloatArray,
+    shown: NDArray[np.bool_],
+) -> FloatArray:
+    """Colours of the texels that no view shows, by diffusion over the surface.
+
+    Args:
+        vertices: ``(V, 3)``; faces: ``(F, 3)``.
+        faces: See ``vertices``.
+        face: ``(N,)`` the face of each texel on the surface.
+        barycentric: ``(N, 3)`` its place on that face.
+        colours: ``(N, 3)``.
+        shown: ``(N,)`` whether a view shows it, in at least one place.
+
+    Returns:
+        ``(M, 3)`` for the M texels that are not shown, in their order.
+    """
+    total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    known = np.flatnonzero(shown)
+    for corner in range(3):
+        vertex = faces[face[known], corner]
+        say = barycentric[known, corner].clip(0, 1).astype(np.float64)
+        weight += np.bincount(vertex, say, minlength=len(vertices))
+        for channel in range(3):
+            total[:, channel] += np.bincount(vertex, say * colours[known, channel], minlength=len(vertices))
+    fixed = weight > 1e-6
+    values = np.where(fixed[:, None], total / np.maximum(weight, 1e-12)[:, None], 0.0)
+    values = _membrane(faces, values, fixed)
+    missing = np.flatnonzero(~shown)
+    spread = np.empty((len(missing), 3), np.float32)
+    for first in range(0, len(missing), _TEXELS_AT_ONCE):
+        some = missing[first : first + _TEXELS_AT_ONCE]
+        at = values[faces[face[some]]]
+        spread[first : first + len(some)] = np.einsum("nk,nkc->nc", barycentric[some], at)
+    return spread
+
+
+def _membrane(
+    faces: NDArray[np.int64], values: NDArray[np.float64], fixed: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Values ``(V, 3)`` at vertices that are the mean of their neighbours wherever they are not fixed."""
+    if fixed.all():
+        return values
+    a, b = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    edges = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(len(values),) * 2).tocsr()
+    # A little pull to the mean keeps pieces solvable that touch nothing known.
+    mean = values[fixed].mean(0)
+    free = np.flatnonzero(~fixed)
+    degree = edges.sum(1)
+    matrix = (diags_array(degree + 1e-6) - edges).tocsr()
+    right = 1e-6 * mean + edges[free][:, fixed] @ values[fixed]
+    filled = values.copy()
+    filled[free] = spsolve(matrix[free][:, free].tocsc(), right).reshape(-1, 3)
+    return filled
+
+
+def _adjacent_faces(faces: NDArray[np.int64]) -> csr_array:
+    """``(F, F)`` 1 for every edge that two faces share."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    order = np.lexsort(edges.T)
+    same = (edges[order][1:] == edges[order][:-1]).all(1)
+    a, b = owner[order][:-1][same], owner[order][1:][same]
+    ones = np.ones(2 * len(a))
+    return coo_array((ones, (np.r_[a, b], np.r_[b, a])), shape=(len(faces),) * 2).tocsr()
