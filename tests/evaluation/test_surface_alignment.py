@@ -21,7 +21,7 @@ def similarity(scale, degrees, shift):
     return T
 
 
-@pytest.mark.parametrize("scale", [0.75, 1.3])
+@pytest.mark.parametrize("scale", [0.3, 0.75, 1.3, 3.0])
 def test_a_shape_of_another_size_is_brought_to_size(scale):
     true, T = box(), similarity(scale, 5.0, (0.1, -0.05, 0.02))
     estimated = true.copy().apply_transform(T)

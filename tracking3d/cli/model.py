@@ -84,6 +84,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
         restore_online_mesh,
         retexture_run,
     )
+    from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader
 
     if model == "none":
@@ -95,6 +96,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
     if model == "fine" or (model == "auto" and has_packages()):
         with show_progress(quiet, plan_shape(frames)):
             shaped = rebuild_shape(run, source, views, largest)
+        note_in_run(run, {"shape": shaped.sentence})
         made, taken = shaped.model, shaped.views
         outcome.append(
             f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence

@@ -2,7 +2,8 @@
 
 If no focal length was given, a method's shape can be right in all but its size: a focal length that is off takes the
 object nearer or farther, and the scale that fits the poses is then that of the distances, not of the object. As for
-"Tanks and temples" (Knapitsch et al., 2017) poses say where to begin, and the surfaces how to go on.
+"Tanks and temples" (Knapitsch et al., 2017) poses say where to begin, and the surfaces how to go on. If the size is off
+by more than closest points can bridge, the surfaces' own size is a second start; the better end counts.
 """
 
 from __future__ import annotations
@@ -47,6 +48,38 @@ def align_surfaces(
     targets, normals = np.asarray(targets), true.face_normals[faces]
     if seen is not None and (shown := seen(targets, normals)).any():
         targets, normals = targets[shown], normals[shown]
+    starts = (T_true_est, _scaled_to_size(T_true_est, points, targets))
+    ends = [_closest_points(start, points, targets, normals, diameter) for start in starts]
+    return min(ends, key=lambda T: _distance(T, points, targets, diameter))
+
+
+def _scaled_to_size(
+    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The similarity with the scale and the position that give points the targets' spread and middle."""
+    moved = points @ T[:3, :3].T
+    scale = float(np.sqrt(targets.var(0).sum() / max(moved.var(0).sum(), 1e-300)))
+    scaled = np.array(T, np.float64)
+    scaled[:3, :3] *= scale
+    scaled[:3, 3] = targets.mean(0) - scale * moved.mean(0)
+    return scaled
+
+
+def _distance(
+    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], diameter: float
+) -> float:
+    """Mean distance of the targets from the moved points, in diameters; far ones count alike."""
+    distance, _ = cKDTree(points @ T[:3, :3].T + T[:3, 3]).query(targets)
+    return float(np.minimum(distance / diameter, 5 * _NEAR).mean())
+
+
+def _closest_points(
+    T_true_est: NDArray[np.float64],
+    points: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    diameter: float,
+) -> NDArray[np.float64]:
     T = np.array(T_true_est, np.float64)
     for _ in range(_STEPS):
         moved = points @ T[:3, :3].T + T[:3, 3]
