@@ -60,7 +60,7 @@ def test_colours_go_on_over_the_surface_as_a_membrane_does():
     spread = spread_colours(MESH.vertices, MESH.faces, face, barycentric, colours * shown[:, None], shown)
     assert spread.shape == ((~shown).sum(), 3)
     apart = np.abs(spread - colours[~shown])
-    assert np.median(apart) < 0.02 and apart.max() < 0.15  # faces of unequal size, edges of equal weight
+    assert np.median(apart) < 0.03 and apart.max() < 0.15  # faces of unequal size, edges of equal weight
 
 
 def test_a_piece_that_touches_nothing_known_takes_the_mean():
