@@ -120,12 +120,12 @@ def observe(
     """Cut the window out of a frame and encode it."""
     rows, columns, border = _within(window, *frame.size)
     pixels = torch.tensor(np.ascontiguousarray(frame.image[rows, columns]), device=device)
-    pixels = functional.pad(pixels.permute(2, 0, 1).float() / 255, border)
+    pixels = _pad(pixels.permute(2, 0, 1).float() / 255, border)
     image, detail = _resample(pixels, window.size), _resample(pixels, 2 * window.size)
     valid = torch.ones(window.size, window.size, device=device)
     if any(border):
         inside = torch.ones(1, rows.stop - rows.start, columns.stop - columns.start, device=device)
-        valid = _resample(functional.pad(inside, border), window.size)[0].ge(0.5).float()
+        valid = _resample(_pad(inside, border), window.size)[0].ge(0.5).float()
     # Features of a stride above 1 are cut out of the finer image, so as not to be coarser than the rest.
     features = encoder.encode((image if encoder.stride == 1 else detail)[None])
     if features.shape[-1] != window.size:
@@ -136,13 +136,13 @@ def observe(
         soft = distance = torch.zeros_like(valid)
     else:
         there = torch.from_numpy(mask[rows, columns]).to(device).float()
-        soft = _resample(functional.pad(there[None], border), window.size)[0]
+        soft = _resample(_pad(there[None], border), window.size)[0]
         distance = mask_distance(soft)
     K = torch.tensor(window.K(camera), dtype=torch.float32, device=device)
     occluder = None
     if frame.occluder is not None:
         covered = torch.from_numpy(frame.occluder[rows, columns]).to(device).float()
-        occluder = _resample(functional.pad(covered[None], border), window.size)[0]
+        occluder = _resample(_pad(covered[None], border), window.size)[0]
     known = mask is not None and bool(soft.any())
     return Observation(
         frame.index, window, K, detail, features[0].float(), valid, soft, distance, known, occluder
@@ -176,7 +176,7 @@ def downsample(observation: Observation) -> Observation:
 def crop(image: Tensor, window: Window) -> Tensor:
     """Resample ``(C, H, W)`` into the window: ``(C, S, S)``, antialiased, zero beyond the border."""
     rows, columns, border = _within(window, *image.shape[-2:])
-    return _resample(functional.pad(image[:, rows, columns], border), window.size)
+    return _resample(_pad(image[:, rows, columns], border), window.size)
 
 
 def _within(window: Window, height: int, width: int) -> tuple[slice, slice, tuple[int, int, int, int]]:
@@ -193,6 +193,11 @@ def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
     end = max(min(first + count, size), begin)
     before = min(max(-first, 0), count)
     return slice(begin, end), before, count - before - (end - begin)
+
+
+def _pad(image: Tensor, border: tuple[int, int, int, int]) -> Tensor:
+    """``(C, H, W)`` with zeros around it; the same if there is no border, which saves a copy."""
+    return functional.pad(image, border) if any(border) else image
 
 
 def _resample(image: Tensor, size: int) -> Tensor:

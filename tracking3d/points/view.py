@@ -179,8 +179,7 @@ def cut_window(
         return None
     xy = seen[:, :2] / seen[:, 2:] * whole[:2] + whole[2:]
     size = np.array([camera.width, camera.height])
-    rows, columns = np.nonzero(mask)
-    pixels = np.concatenate([xy, np.stack([columns, rows], 1)])
+    pixels = np.concatenate([xy, _corners_of(mask)])
     low = np.clip(np.floor(pixels.min(0)) - MARGIN, 0, size).astype(int)
     high = np.clip(np.ceil(pixels.max(0)) + MARGIN + 1, 0, size).astype(int)
     if (high - low < 8).any():
@@ -194,6 +193,14 @@ def cut_window(
         grey, inside = (cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (grey, inside))
     scale = np.array([width / (right - left), height / (bottom - top)])
     return GreyWindow(np.asarray(grey, np.uint8), inside, (left, top), scale)
+
+
+def _corners_of(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """``(2, 2)`` the first and the last column and row of a mask; ``(0, 2)`` of an empty one."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if not width:
+        return np.zeros((0, 2), np.int64)
+    return np.array([[left, top], [left + width - 1, top + height - 1]])
 
 
 def draw_into_window(

@@ -79,7 +79,7 @@ def shape_view(
     if box is None:
         return None
     window = Window.around(box, _MARGIN, side)
-    inside = (crop_window(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
+    inside = (crop_window(mask, window) > 0.5) & inside_frame(mask.shape, window)
     if not inside.any():
         return None
     height, width = mask.shape

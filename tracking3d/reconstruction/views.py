@@ -68,7 +68,7 @@ def texture_view(
         return None
     window = Window.around(box, _MARGIN, 1)
     window = Window(window.left, window.top, window.side, min(window.side, _LARGEST))
-    inside = (crop_window(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
+    inside = (crop_window(mask, window) > 0.5) & inside_frame(mask.shape, window)
     depth = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
     valid = np.clip((depth - _OUTLINE[0]) / (_OUTLINE[1] - _OUTLINE[0]), 0.0, 1.0).astype(np.float32)
     if not valid.any():

@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +19,8 @@ from numpy.typing import NDArray
 from tracking3d.errors import OutputError
 from tracking3d.results.layout import OUT, partial_path
 
+OCCLUDER = 64
+"""Level of what is in front of the object, in the images of ``initial_masks/``."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _BLOCK = 4096  # bytes that file systems give out at once
@@ -132,9 +138,58 @@ def mask_file(mask: NDArray[np.bool_]) -> bytes:
 
 def read_mask(path: Path) -> NDArray[np.bool_] | None:
     """Read a mask written by `write_mask`: ``(H, W)`` bool, or None if there is no such image."""
-    if not path.is_file():
+    kept = read_packed_mask(path)
+    return None if kept is None else unpack(kept.mask, kept.shape)
+
+
+@dataclass(frozen=True)
+class PackedMask:
+    """A mask image that was decoded, as bits.
+
+    Attributes:
+        shape: ``(H, W)``.
+        mask: The pixels from 128 on, see `unpack`.
+        occluder: The pixels of `OCCLUDER`; None if there are none.
+    """
+
+    shape: tuple[int, int]
+    mask: bytes
+    occluder: bytes | None
+
+
+def read_packed_mask(path: Path) -> PackedMask | None:
+    """A mask image as bits; None if there is no such image.
+
+    Those that were read are kept: several steps look at the same masks, and decoding a large image takes twenty times
+    as long as unpacking it.
+    """
+    try:
+        status = path.stat()
+    except OSError:
         return None
-    return decode_mask(path.read_bytes())
+    if not stat.S_ISREG(status.st_mode):
+        return None
+    return _read_version(path, status.st_ino, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _read_version(path: Path, *version: int) -> PackedMask | None:
+    levels = decode_grey(path.read_bytes())
+    if levels is None:
+        return None
+    occluder = levels == OCCLUDER
+    height, width = levels.shape
+    return PackedMask((height, width), _pack(levels >= 128), _pack(occluder) if occluder.any() else None)
+
+
+def _pack(mask: NDArray[np.bool_]) -> bytes:
+    return zlib.compress(np.packbits(mask).tobytes(), 1)
+
+
+def unpack(packed: bytes, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """``(H, W)`` the mask of some bits in a `PackedMask`."""
+    bits = np.frombuffer(zlib.decompress(packed), np.uint8)
+    return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).view(np.bool_)
 
 
 def decode_mask(data: bytes) -> NDArray[np.bool_] | None:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_image
-from tracking3d.results.visible_masks import OCCLUDER, expect_visible_masks
+from tracking3d.results.files import OCCLUDER, read_mask, write_image
+from tracking3d.results.visible_masks import expect_visible_masks
 
 _OBJECT = 255
 

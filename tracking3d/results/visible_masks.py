@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.results import layout
-from tracking3d.results.files import decode_grey, read_mask, write_mask, writing
-
-OCCLUDER = 64
-"""What is in front of the object, in the images of ``initial_masks/``."""
+from tracking3d.results.files import read_mask, read_packed_mask, unpack, write_mask, writing
 
 
 def expect_visible_masks(folder: Path) -> None:
@@ -50,9 +47,5 @@ def write_visible_masks(folder: Path) -> None:
 
 def read_occluder(folder: Path, index: int) -> NDArray[np.bool_] | None:
     """What is in front of the object in frame ``index``, ``(H, W)``; None if nothing is known to be."""
-    path = layout.initial_mask_path(folder, index)
-    levels = decode_grey(path.read_bytes()) if path.is_file() else None
-    if levels is None:
-        return None
-    occluder = levels == OCCLUDER
-    return occluder if occluder.any() else None
+    kept = read_packed_mask(layout.initial_mask_path(folder, index))
+    return None if kept is None or kept.occluder is None else unpack(kept.occluder, kept.shape)

@@ -94,14 +94,13 @@ class FrameWindow:
         window = Window(window.left, window.top, window.side, min(window.side, LARGEST))
         valid = inside_frame(frame.initial.shape, window)
         initial, answer = (
-            (crop_window(mask.astype(np.float32), window) > 0.5) & valid
-            for mask in (frame.initial, frame.answer)
+            (crop_window(mask, window) > 0.5) & valid for mask in (frame.initial, frame.answer)
         )
         K, T_cam_obj = window.K(camera), frame.T_cam_obj
         drawn, inverse_depth = surface_in(K, T_cam_obj, vertices, faces, window.size)
         image, occluder = crop_window(frame.image, window), None
         if frame.occluder is not None:
-            occluder = (crop_window(frame.occluder.astype(np.float32), window) > 0.5) & valid
+            occluder = (crop_window(frame.occluder, window) > 0.5) & valid
         return cls(
             window,
             image,

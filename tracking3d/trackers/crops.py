@@ -14,11 +14,13 @@ from tracking3d.geometry.camera import Window
 def crop_window(image: NDArray, window: Window) -> NDArray:
     """What ``window`` sees of ``image`` ``(H, W)`` or ``(H, W, C)``, resampled to ``(size, size[, C])``.
 
-    The part of the window beyond the frame repeats the frame's border.
+    The part of the window beyond the frame repeats the frame's border. A mask becomes float32.
     """
     rows, above, below = _span(window.top, window.side, image.shape[0])
     columns, before, after = _span(window.left, window.side, image.shape[1])
     region = image[rows, columns]
+    if region.dtype == np.bool_:
+        region = region.astype(np.float32)
     if above or below or before or after:
         region = cv2.copyMakeBorder(region, above, below, before, after, cv2.BORDER_REPLICATE)
     method = cv2.INTER_AREA if window.size < window.side else cv2.INTER_LINEAR

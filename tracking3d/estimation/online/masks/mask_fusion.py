@@ -140,5 +140,5 @@ def occluder_in_window(observation: Observation) -> NDArray[np.bool_] | None:
 def mask_in_window(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
     """``(S, S)`` a mask ``(H, W)`` cropped to a window."""
     # Pixels beyond the frame are not the object, although `crop_window` repeats the border.
-    seen = crop_window(mask.astype(np.float32), window) > 0.5
+    seen = crop_window(mask, window) > 0.5
     return np.asarray(seen & inside_frame(mask.shape, window))
