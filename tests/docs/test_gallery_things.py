@@ -98,4 +98,4 @@ def test_every_clip_is_tracked_where_it_was_written():
         line.split()[1] for line in commands(PAGE, "python") if line.startswith("docs/images/owl_clip.py ")
     }
     tracked = {line.split()[1].removesuffix("/frames") for line in lines if line.startswith("run ")}
-    assert made == tracked and len(made) == len(NAMES) + 1
+    assert made == tracked and len(made) == len(NAMES) + 3  # the owl, and two videos of the blocks

@@ -1,13 +1,17 @@
-"""Makes the picture of shapes from eight sides: that of the online map, the one made anew, and that with its texture.
+"""Makes the picture of a run's shapes from eight sides: the online one, the final one, and that with its texture.
 
 $ tracking3d model RUN --model fine
-$ python docs/images/shape_anew.py RUN picture.jpg
-$ python docs/images/shape_anew.py RUN picture.jpg --truth CLIP    # the true shape above them
+$ python docs/images/eight_sides.py RUN picture.jpg
+$ python docs/images/eight_sides.py RUN picture.jpg --truth CLIP    # the true shape above them
+$ python docs/images/eight_sides.py RUN picture.jpg --beside EARLIER ALONE    # models of several runs, with texture
+
+EARLIER is the run that RUN extends, ALONE one of RUN's video alone.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +23,12 @@ from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.evaluation.pose_scores import fit_alignment, pair_poses
 from tracking3d.frames import Image
+from tracking3d.geometry.similarity import Similarity
+from tracking3d.reconstruction.extension import NOTE
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.mesh_view import render_view
+from tracking3d.results.run_reader import RunReader
 
 SIDES, SIDE, TILT = 8, 150, 20.0
 GREY, QUALITY = 190, 88
@@ -55,13 +62,29 @@ def true_shape(run: Path, clip: Path, like: ObjectModel) -> ObjectModel:
     )
 
 
+def in_coordinates_of(run: Path, other: Path) -> ObjectModel:
+    """The model of another run in the coordinates of a run that extends it, or of one of the same video."""
+    model, note = load_model(other), RunReader(run).description.get(NOTE) or {}
+    if Path(note.get("run", "")).resolve() != other.resolve():
+        return model
+    similarity = Similarity(np.array(note["R"]), note["scale"], np.array(note["translation"]))
+    return replace(model, vertices=similarity.points(model.vertices))
+
+
+def from_eight_sides(models: Sequence[ObjectModel]) -> Image:
+    """A row for each model."""
+    return np.vstack(
+        [np.hstack([render_view(one, rotation(n), SIDE) for n in range(SIDES)]) for one in models]
+    )
+
+
 def picture(run: Path, clip: Path | None) -> Image:
     """``(N SIDE, SIDES SIDE, 3)``."""
     made, online = load_model(run), load_model(run / layout.ONLINE)
     rows = [grey(online), grey(made), made]
     if clip is not None:
         rows.insert(0, grey(true_shape(run, clip, online)))
-    return np.vstack([np.hstack([render_view(one, rotation(n), SIDE) for n in range(SIDES)]) for one in rows])
+    return from_eight_sides(rows)
 
 
 if __name__ == "__main__":
@@ -69,6 +92,12 @@ if __name__ == "__main__":
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--truth", type=Path, default=None)
+    parser.add_argument("--beside", type=Path, nargs="+", default=())
     given = parser.parse_args()
-    made = cv2.cvtColor(picture(given.run, given.truth), cv2.COLOR_RGB2BGR)
+    if given.beside:
+        others = [in_coordinates_of(given.run, other) for other in given.beside]
+        drawn = from_eight_sides([*others, load_model(given.run)])
+    else:
+        drawn = picture(given.run, given.truth)
+    made = cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR)
     cv2.imwrite(str(given.out), made, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
