@@ -26,12 +26,12 @@ def test_a_shape_of_another_size_is_brought_to_size(scale):
     true, T = box(), similarity(scale, 5.0, (0.1, -0.05, 0.02))
     estimated = true.copy().apply_transform(T)
     found = align_surfaces(estimated, true, 1.3, np.eye(4))
-    np.testing.assert_allclose(found @ T, np.eye(4), atol=0.01)
+    assert min(np.abs(fit @ T - np.eye(4)).max() for fit in found) < 0.01
 
 
 def test_a_part_that_nobody_saw_has_no_say():
     true = box()
     horn = trimesh.creation.box((0.1, 0.1, 1.5), trimesh.transformations.translation_matrix((0, 0, -0.9)))
     estimated = trimesh.util.concatenate([true, horn]).apply_scale(1.1)
-    found = align_surfaces(estimated, true, 1.3, np.eye(4), lambda points, normals: normals[:, 2] > -0.5)
+    found, _ = align_surfaces(estimated, true, 1.3, np.eye(4), lambda points, normals: normals[:, 2] > -0.5)
     assert np.cbrt(np.linalg.det(found[:3, :3])) == pytest.approx(1 / 1.1, abs=0.01)

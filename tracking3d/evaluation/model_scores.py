@@ -95,8 +95,9 @@ def score_model(
                 seen = make_visibility_test(mesh, diameter, list(truth.T_cam_obj.values()), truth.camera)
             estimated = answers.mesh()
             shape = shape_scores(estimated, mesh, diameter, alignment.T_true_est, SAMPLES, seen=seen)
-            T_true_est = align_surfaces(estimated, mesh, diameter, alignment.T_true_est, seen)
-            fitted = shape_scores(estimated, mesh, diameter, T_true_est, SAMPLES, seen=seen)
+            fits = align_surfaces(estimated, mesh, diameter, alignment.T_true_est, seen)
+            scores = [shape_scores(estimated, mesh, diameter, fit, SAMPLES, seen=seen) for fit in fits]
+            fitted = max([shape, *scores], key=lambda one: _seen_or_all(one)[0])
         except ValueError:  # the method has no surface: there is nothing to measure
             shape = fitted = None
     return ModelScores(
@@ -106,9 +107,16 @@ def score_model(
         bop_ar_mspd=recall.mspd,
         chamfer_percent=100 * shape.chamfer if shape else None,
         **(_of_shape(shape) if shape else {}),
-        shape_f_score_fitted=(fitted.f_score_seen or fitted.f_score) if fitted else None,
-        shape_f_score_fine_fitted=(fitted.f_score_fine_seen or fitted.f_score_fine) if fitted else None,
+        shape_f_score_fitted=_seen_or_all(fitted)[0] if fitted else None,
+        shape_f_score_fine_fitted=_seen_or_all(fitted)[1] if fitted else None,
     )
+
+
+def _seen_or_all(shape: ShapeScores) -> tuple[float, float]:
+    """F-scores at 2 and at 1 percent of what was seen, or of all of the surface if that is not known."""
+    if shape.f_score_seen is None or shape.f_score_fine_seen is None:
+        return shape.f_score, shape.f_score_fine
+    return shape.f_score_seen, shape.f_score_fine_seen
 
 
 def _of_shape(shape: ShapeScores) -> dict[str, float | None]:

@@ -3,7 +3,7 @@
 If no focal length was given, a method's shape can be right in all but its size: a focal length that is off takes the
 object nearer or farther, and the scale that fits the poses is then that of the distances, not of the object. As for
 "Tanks and temples" (Knapitsch et al., 2017) poses say where to begin, and the surfaces how to go on. If the size is off
-by more than closest points can bridge, the surfaces' own size is a second start; the better end counts.
+by more than closest points can bridge, the surfaces' own size is a second start.
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ def align_surfaces(
     diameter: float,
     T_true_est: NDArray[np.float64],
     seen: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]] | None = None,
-) -> NDArray[np.float64]:
-    """``(4, 4)`` similarity from estimated to true coordinates, by iterative closest points, point to plane.
+) -> list[NDArray[np.float64]]:
+    """Similarities ``(4, 4)`` from estimated to true coordinates, by iterative closest points, point to plane.
+
+    Begun at the poses' similarity, and at the size of the surfaces; which is better is for the caller to score. If
+    little was seen, such as three sides of a box at a corner, closest points leave the size open, and neither is good.
 
     Args:
         estimated: In estimated object coordinates.
@@ -49,8 +52,7 @@ def align_surfaces(
     if seen is not None and (shown := seen(targets, normals)).any():
         targets, normals = targets[shown], normals[shown]
     starts = (T_true_est, _scaled_to_size(T_true_est, points, targets))
-    ends = [_closest_points(start, points, targets, normals, diameter) for start in starts]
-    return min(ends, key=lambda T: _distance(T, points, targets, diameter))
+    return [_closest_points(start, points, targets, normals, diameter) for start in starts]
 
 
 def _scaled_to_size(
@@ -63,14 +65,6 @@ def _scaled_to_size(
     scaled[:3, :3] *= scale
     scaled[:3, 3] = targets.mean(0) - scale * moved.mean(0)
     return scaled
-
-
-def _distance(
-    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], diameter: float
-) -> float:
-    """Mean distance of the targets from the moved points, in diameters; far ones count alike."""
-    distance, _ = cKDTree(points @ T[:3, :3].T + T[:3, 3]).query(targets)
-    return float(np.minimum(distance / diameter, 5 * _NEAR).mean())
 
 
 def _closest_points(
