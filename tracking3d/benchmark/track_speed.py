@@ -12,8 +12,10 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 PERCENTILES = (50, 95, 100)
+_POLL = 0.01  # seconds between looks at a file
 _WARM_UP = 2  # frames of a run before the measured ones: it compiles kernels, and reads files once
 
 
@@ -121,13 +124,36 @@ def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -
     ]  # fmt: skip
     shutil.rmtree(folder, ignore_errors=True)  # another version would have to be able to read it
     before, started = _processor(), time.perf_counter()
-    done = _python(contender, "tracking3d", *command)
+    with _first_line_in(folder / layout.FRAMES) as first_line:
+        done = _python(contender, "tracking3d", *command)
     wall, after = time.perf_counter() - started, _processor()
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no error output"])[-1]
         raise InputError(f"{contender.name} cannot track {truth.name}: {said}")
     spent = None if before is None or after is None else after - before
-    return _parse_speed(contender.name, folder, wall, spent)
+    return _parse_speed(contender.name, folder, wall, spent, first_line[0] - started if first_line else wall)
+
+
+@contextmanager
+def _first_line_in(file: Path) -> Iterator[list[float]]:
+    """Note when a file that another process writes is no longer empty: the one entry of the list, once it is."""
+    found: list[float] = []
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_POLL):
+            with suppress(OSError):
+                if file.stat().st_size:
+                    found.append(time.perf_counter())
+                    return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield found
+    finally:
+        over.set()
+        watcher.join()
 
 
 def _compile_ahead(contender: Contender) -> None:
@@ -146,7 +172,9 @@ def _python(contender: Contender, module: str, *words: str) -> subprocess.Comple
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
-def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) -> TrackSpeed:
+def _parse_speed(
+    name: str, folder: Path, wall: float, processor: float | None, first_answer: float
+) -> TrackSpeed:
     """The figures in a run folder."""
     reader = RunReader(folder)
     run = reader.description
@@ -168,7 +196,7 @@ def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) 
         frames=len(records),
         wall=wall,
         processor=processor,
-        first_answer=max(wall - causal - again, 0.0) + whole[0],
+        first_answer=first_answer,
         frames_per_second=(len(records) - 1) / rest if len(records) > 1 and rest > 0 else None,
         delays=tuple(float(np.percentile(whole, share)) for share in PERCENTILES),
         stages=sum(times, StageTimes()) * (1 / len(times)),
