@@ -17,7 +17,7 @@ from tracking3d.pipeline.correct import correct_run, replaced_by_correction
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.corrections import Correction
-from tracking3d.reconstruction import final_shape
+from tracking3d.reconstruction import rebuild
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import export_mesh, load_model
@@ -70,7 +70,7 @@ def rebuilt(run, monkeypatch) -> list[Path]:
             export_mesh(into, load_model(folder))
         return SimpleNamespace(sentence="A new shape.")
 
-    monkeypatch.setattr(final_shape, "rebuild_shape", reconstruct)
+    monkeypatch.setattr(rebuild, "rebuild_shape", reconstruct)
     reconstruct(run, None)
     folders.clear()
     return folders
@@ -88,7 +88,7 @@ def test_a_reconstructed_shape_is_reconstructed_again_before_the_run_is_replaced
 def test_until_the_shape_is_there_the_run_stays_and_the_same_call_makes_only_that(run, rebuilt, monkeypatch):
     before = (run / layout.FRAMES).read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(final_shape, "rebuild_shape", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt()))
+        patch.setattr(rebuild, "rebuild_shape", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             correct_run(run, GIVEN)
     take_over(run)  # as whatever comes next does
