@@ -24,7 +24,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.evaluation.pose_scores import fit_alignment, pair_poses
 from tracking3d.frames import Image
 from tracking3d.geometry.similarity import Similarity
-from tracking3d.reconstruction.extension import NOTE
+from tracking3d.reconstruction.rebuild import EXTENDS
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.mesh_view import render_view
@@ -64,7 +64,7 @@ def true_shape(run: Path, clip: Path, like: ObjectModel) -> ObjectModel:
 
 def in_coordinates_of(run: Path, other: Path) -> ObjectModel:
     """The model of another run in the coordinates of a run that extends it, or of one of the same video."""
-    model, note = load_model(other), RunReader(run).description.get(NOTE) or {}
+    model, note = load_model(other), RunReader(run).description.get(EXTENDS) or {}
     if Path(note.get("run", "")).resolve() != other.resolve():
         return model
     similarity = Similarity(np.array(note["R"]), note["scale"], np.array(note["translation"]))

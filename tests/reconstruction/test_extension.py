@@ -18,17 +18,27 @@ from tracking3d.cli import app
 from tracking3d.errors import InputError
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction import extension
-from tracking3d.reconstruction.extension import NOTE, extend_run
+from tracking3d.reconstruction.extension import check_earlier_run, extend_run
+from tracking3d.reconstruction.rebuild import EXTENDS
 from tracking3d.reconstruction.registration import fit_points, register_run
 from tracking3d.reconstruction.surface_keypoints import keep_different, surface_keypoints
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import scale_run, unit_scale
 from tracking3d.results.unseen_surface import find_seen_faces
 
 TO_OWN = Similarity(
     Rotation.from_euler("xyz", [40, -70, 20], degrees=True).as_matrix(), 1.7, np.array([0.3, -0.2, 0.5])
 )
 """From the coordinates of the other run to those of the run."""
+
+
+SAME = {"R": np.eye(3).tolist(), "scale": 1.0, "translation": [0, 0, 0]}
+
+
+def noted(run, note):
+    path = run / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), EXTENDS: note}))
 
 
 def in_own(T_cam_other):
@@ -122,7 +132,7 @@ def test_the_model_shows_the_sides_of_both_videos(two_runs, tmp_path):
     assert seen_share(run) > seen_share(alone) + 0.08
     radius = np.linalg.norm((load_model(run).vertices - TO_OWN.translation) / TO_OWN.scale, axis=1)
     assert np.median(np.abs(radius - 1)) < 0.05
-    note = RunReader(run).description[NOTE]
+    note = RunReader(run).description[EXTENDS]
     assert note["run"] == str(earlier.resolve()) and note["scale"] == pytest.approx(TO_OWN.scale, rel=0.01)
     assert {path: path.read_bytes() for path in earlier.rglob("*") if path.is_file()} == before
 
@@ -133,9 +143,7 @@ def test_a_run_that_extends_others_brings_their_frames_too(two_runs, tmp_path, m
         shutil.copytree(two_runs[1], tmp_path / "earlier"),
     )
     first = shutil.copytree(two_runs[1], tmp_path / "first")
-    description = json.loads((earlier / "run.json").read_text())
-    eye = {"R": np.eye(3).tolist(), "scale": 1.0, "translation": [0, 0, 0]}
-    (earlier / "run.json").write_text(json.dumps({**description, NOTE: {"run": str(first), **eye}}))
+    noted(earlier, {"run": str(first), **SAME})
     given = []
 
     def reshape(*arguments):
@@ -154,6 +162,55 @@ def test_a_run_that_extends_others_brings_their_frames_too(two_runs, tmp_path, m
         x, y, z = view.P @ [*TO_OWN.translation, 1]
         middle = np.argwhere(view.mask).mean(0)[::-1]
         np.testing.assert_allclose((x / z, y / z), middle, atol=3)
+
+
+def test_runs_that_extend_each_other_do_not_bring_the_same_frames_twice(two_runs, tmp_path):
+    run, earlier = (shutil.copytree(one, tmp_path / one.parent.name) for one in two_runs)
+    noted(earlier, {"run": str(run), **SAME})
+    assert list(extension._runs_extended_by(RunReader(earlier), TO_OWN, 4, run)) == []
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        3,
+        {},
+        {"run": 3},
+        {"run": "x", **SAME, "R": [1, 2]},
+        {"run": "x", **SAME, "scale": 0},
+        {"run": "gone", **SAME},
+    ],
+)
+def test_a_chain_ends_where_it_is_damaged(two_runs, tmp_path, note, caplog):
+    earlier = shutil.copytree(two_runs[1], tmp_path / "earlier")
+    noted(earlier, note)
+    assert list(extension._runs_extended_by(RunReader(earlier), TO_OWN, 4, two_runs[0])) == []
+    assert "without the runs that it extends itself" in caplog.text
+
+
+def test_runs_that_are_put_into_metres_later_keep_their_similarity(two_runs, tmp_path):
+    earlier, first = (shutil.copytree(two_runs[1], tmp_path / name) for name in ("earlier", "first"))
+    noted(earlier, {"run": str(first), **SAME, "scale": 2.0, "translation": [0.1, 0.2, 0.3]})
+    scale_run(earlier, 0.5)
+    factor = unit_scale(RunReader(earlier))
+    _, found = extension._parse_note(RunReader(earlier), RunReader(earlier).description[EXTENDS])
+    assert found.scale == pytest.approx(2 * factor) and factor != 1
+    np.testing.assert_allclose(found.translation, factor * np.array([0.1, 0.2, 0.3]))
+
+
+def test_a_video_that_is_not_there_is_said_before_anything_is_tracked(two_runs, tmp_path):
+    earlier = shutil.copytree(two_runs[1], tmp_path / "earlier")
+    description = json.loads((earlier / "run.json").read_text())
+    (earlier / "run.json").write_text(json.dumps({**description, "source": "gone.mp4"}))
+    with pytest.raises(InputError, match="put it where its run"):
+        check_earlier_run(earlier)
+
+
+def test_a_mesh_that_is_made_again_from_one_video_forgets_the_other(two_runs, tmp_path):
+    run = shutil.copytree(two_runs[0], tmp_path / "run")
+    noted(run, {"run": str(two_runs[1]), **SAME})
+    CliRunner().invoke(app, ["model", str(run), "--source", str(two_runs[0].parent / "frames"), "--quiet"])
+    assert RunReader(run).description[EXTENDS] is None
 
 
 def test_a_run_cannot_extend_itself(two_runs):

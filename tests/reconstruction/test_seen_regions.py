@@ -49,6 +49,11 @@ def test_the_texels_of_a_face_are_seen_together():
     np.testing.assert_array_equal(seen[inner], FRONT[face][inner])
 
 
+def test_faces_without_a_texel_follow_the_others():
+    face = np.flatnonzero(np.random.default_rng(5).random(len(FRONT)) < 0.3)
+    assert select_seen_texels(MESH.vertices, MESH.faces, face, np.ones(len(face), bool)).all()
+
+
 def test_colours_go_on_over_the_surface_as_a_membrane_does():
     """Between two rings of known colours at z = -a and z = a, a harmonic function of a sphere is atanh(z)."""
     face, barycentric = face_texels()

@@ -111,6 +111,7 @@ def check_extended(settings: PipelineConfig, objects: int, split: bool) -> None:
     if settings.object.extends is None:
         return
     from tracking3d.pipeline.known_object import read_known_object
+    from tracking3d.reconstruction.extension import check_earlier_run
     from tracking3d.reconstruction.rebuild import check_packages
 
     if objects > 1 or split:
@@ -118,4 +119,8 @@ def check_extended(settings: PipelineConfig, objects: int, split: bool) -> None:
             "--extend makes one model of one object; give one box or mask, and leave out --split."
         )
     check_packages()
-    read_known_object(Path(settings.object.extends))
+    earlier = Path(settings.object.extends)
+    if not earlier.is_dir():
+        raise InputError(f"{earlier} is not the folder of an earlier run; give one by --object RUN --extend.")
+    read_known_object(earlier)
+    check_earlier_run(earlier)

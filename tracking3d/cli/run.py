@@ -115,7 +115,9 @@ def _configure(
         camera=camera.settings(),
         object={
             "model": None if prompt.extend else prompt.known,
-            "extends": prompt.known if prompt.extend else None,
+            "extends": str(Path(prompt.known).expanduser().absolute())
+            if prompt.extend and prompt.known
+            else None,
             "flat": tracking.flat or None,
             "trust_masks": tracking.trust_masks or None,
             "prototype": tracking.prototype,

@@ -30,6 +30,8 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
 
+EXTENDS = "extends"
+"""Key in ``run.json`` of the run whose frames made the mesh, too."""
 _TEXTURE_VIEWS = 24
 _NEEDED = ("skimage", "xatlas", "fast_simplification")
 
@@ -231,6 +233,8 @@ def _replace_mesh(run: RunReader, model: ObjectModel) -> None:
     """Write the mesh of a run, and what shows it or speaks of it: its notes and its contact sheet."""
     report_progress("writing the model")
     export_mesh(run.mesh_folder, model, run.unit)
+    if run.description.get(EXTENDS):  # whose mesh this no longer is; who extends the run notes it again
+        note_in_run(run.folder, {EXTENDS: None})
     if "notes" in run.description:
         note_in_run(run.folder, {"notes": notes_of_run(run.description, model, run.frames)})
     if (run.folder / layout.CONTACT_SHEET).is_file():

@@ -20,7 +20,10 @@ _TEXELS_AT_ONCE = 1 << 16
 
 
 def smooth_seen_share(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], share: NDArray[np.float64]
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    share: NDArray[np.float64],
+    known: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """The share ``(F,)`` of each face that was seen, averaged over the faces around it, each counting by its area.
 
@@ -28,15 +31,19 @@ def smooth_seen_share(
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
         share: ``(F,)`` in [0, 1].
+        known: ``(F,)`` faces that have a share, since they have a texel; others take that of the faces around them.
     """
     corners = vertices[faces]
     area = (
         np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-12
     )
     adjacent = _adjacent_faces(faces)
-    around = area + adjacent @ area
+    weight = area if known is None else area * known
+    total = weight * share
     for _ in range(_ROUNDS):
-        share = (area * share + adjacent @ (area * share)) / around
+        total, weight = total + adjacent @ total, weight + adjacent @ weight
+        share = np.where(weight > 0, total / np.maximum(weight, 1e-300), 0.0)
+        total, weight = area * share, area * (weight > 0)
     return share
 
 
@@ -56,7 +63,7 @@ def select_seen_texels(
     """
     count = np.bincount(face, minlength=len(faces))
     share = np.bincount(face, shown, minlength=len(faces)) / np.maximum(count, 1)
-    return np.asarray((smooth_seen_share(vertices, faces, share) > _SEEN)[face])
+    return np.asarray((smooth_seen_share(vertices, faces, share, count > 0) > _SEEN)[face])
 
 
 def spread_colours(

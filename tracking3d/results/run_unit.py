@@ -135,6 +135,11 @@ def scale_run(folder: Path, object_size: float) -> None:
     _scale_by(folder, now, factors)
 
 
+def unit_scale(run: RunReader) -> float:
+    """Metres in the unit that a run was estimated in, if it was put into metres; else 1."""
+    return _scales(run).scale
+
+
 def read_own_records(run: RunReader) -> list[FrameRecord]:
     """The frames of a run in the unit that it was estimated in.
 
