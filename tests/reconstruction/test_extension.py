@@ -21,7 +21,7 @@ from tracking3d.reconstruction import extension
 from tracking3d.reconstruction.extension import check_earlier_run, extend_run
 from tracking3d.reconstruction.rebuild import EXTENDS
 from tracking3d.reconstruction.registration import fit_points, register_run
-from tracking3d.reconstruction.surface_keypoints import keep_different, surface_keypoints
+from tracking3d.reconstruction.surface_keypoints import shows_other_side, surface_keypoints
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import scale_run, unit_scale
@@ -83,7 +83,7 @@ def test_keypoints_lie_on_the_surface():
 
 def test_frames_that_are_alike_are_not_kept_twice():
     kept = frames([0, 30], ball())
-    assert not keep_different(kept, pose(3)) and keep_different(kept, pose(15))
+    assert not shows_other_side(kept, pose(3)) and shows_other_side(kept, pose(15))
 
 
 def test_the_similarity_is_found_from_both_videos():

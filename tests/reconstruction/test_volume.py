@@ -106,6 +106,26 @@ def test_a_shape_that_covers_the_object_stays_as_it_is(around):
     np.testing.assert_array_equal(restore_uncovered(grid, hull, ball, around), ball)
 
 
+def test_what_lies_beyond_a_window_has_no_vote(around):
+    mesh = sphere(6)
+    grid = Grid.around(mesh.vertices, 16, 0.2)
+    ball = mesh_distance(grid, mesh.vertices, mesh.faces, 0.5)
+    everywhere = np.full(len(grid.points), 0.1, np.float32)
+    # The object fills the windows, whose edges many voxels lie beyond.
+    nearer = np.diag([3, 3, 1])
+    full = np.full_like(around[0].depth_inside, 5)
+    close = [replace(view, K=nearer @ view.K, depth_inside=full) for view in around]
+    seen_by = np.zeros(len(grid.points), int)
+    for view in close:
+        x, y, z = view.P[:, :3] @ grid.points.T + view.P[:, 3:]
+        seen_by += (
+            (np.rint(x / z) >= 0) & (np.rint(x / z) < SIDE) & (np.rint(y / z) >= 0) & (np.rint(y / z) < SIDE)
+        )
+    half = np.minimum(ball, grid.points[:, 1] + 0.2)
+    restored = restore_uncovered(grid, everywhere, half, close)
+    assert (restored != half).any() and (seen_by[restored != half] >= 3).all()
+
+
 def test_where_there_is_no_shape_the_hull_takes_its_place(around):
     grid = Grid.around(sphere(6).vertices, 12, 0.2)
     hull, _ = carve_hull(grid.points, around, 0.4)

@@ -1,4 +1,4 @@
-"""What the reliable frames of a run say of its object, collected in one pass over its video."""
+"""What the reliable frames of a run show of its object, collected in one pass over its video."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
 from tracking3d.reconstruction.reliable_frames import reliable_frames
 from tracking3d.reconstruction.shape import MOST
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
-from tracking3d.reconstruction.surface_keypoints import SurfaceKeypoints, keep_different, surface_keypoints
+from tracking3d.reconstruction.surface_keypoints import SurfaceKeypoints, shows_other_side, surface_keypoints
 from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
@@ -92,7 +92,7 @@ def collect_views(
             shapes = spread_by_rotation(shapes, 0.5, 2 * MOST)
         if len(left_out) > 2 * MOST_LEFT_OUT:
             left_out = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
-        if model is not None and keep_different(keypoints, np.asarray(record.T_cam_obj)):
+        if model is not None and shows_other_side(keypoints, np.asarray(record.T_cam_obj)):
             mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
             keypoints.append(
                 surface_keypoints(frame.image, mask, camera, np.asarray(record.T_cam_obj), model)

@@ -1,6 +1,6 @@
 """What was seen of a surface as whole regions, and colours for the rest, carried over the surface.
 
-At grazing angles views show single texels and miss those between them. Such a face is told by its neighbours: whether
+At grazing angles views show single texels and miss those between them. Such a face follows its neighbours: whether
 it counts as seen is averaged over the surface, so that the border of what was seen is a line and not a spray of specks.
 Colours that no view shows are those of a membrane over the surface, fixed where colours are known: they continue what
 is next to them on the object, not what happens to lie beside it in the atlas.
@@ -91,10 +91,10 @@ def spread_colours(
     known = np.flatnonzero(shown)
     for corner in range(3):
         vertex = faces[face[known], corner]
-        say = barycentric[known, corner].clip(0, 1).astype(np.float64)
-        weight += np.bincount(vertex, say, minlength=len(vertices))
+        part = barycentric[known, corner].clip(0, 1).astype(np.float64)
+        weight += np.bincount(vertex, part, minlength=len(vertices))
         for channel in range(3):
-            total[:, channel] += np.bincount(vertex, say * colours[known, channel], minlength=len(vertices))
+            total[:, channel] += np.bincount(vertex, part * colours[known, channel], minlength=len(vertices))
     fixed = weight > 1e-6
     values = np.where(fixed[:, None], total / np.maximum(weight, 1e-12)[:, None], 0.0)
     values = _membrane(faces, values, fixed)

@@ -10,14 +10,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.meshing import decimate_roughly, extract_surface
+from tracking3d.reconstruction.plane_sweep import Guide
 from tracking3d.reconstruction.shape_views import ShapeView
-from tracking3d.rendering.renderer import project
-from tracking3d.rendering.visibility import rasterize
 
 LEAST_VIEWS = 3
 """Views that have to see a voxel at a pixel of the object that the shape does not cover."""
@@ -43,32 +41,27 @@ def restore_uncovered(
     if found is None:
         return hull
     mesh = decimate_roughly(found, _FACES)
+    guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
     asked = np.flatnonzero((hull > 0) & (shape <= 0))
     points = grid.points[asked]
     votes = np.zeros(len(asked), int)
     for view in views:
-        uncovered = _uncovered_pixels(
-            np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64), view
-        )
+        uncovered = _uncovered_pixels(guide, view)
         if uncovered.any():
             x, y, z = view.P[:, :3].astype(np.float32) @ points.T + view.P[:, 3:].astype(np.float32)
             z = np.maximum(z, 1e-6)
-            column, row = (np.rint(value / z).clip(0, len(uncovered) - 1).astype(int) for value in (x, y))
-            votes += uncovered[row, column]
+            pixel = np.rint(np.stack([y, x]) / z)
+            inside = ((pixel >= 0) & (pixel < len(uncovered))).all(0)
+            row, column = pixel[:, inside].astype(int)
+            votes[inside] += uncovered[row, column]
     restored = shape.copy()
     missing = asked[votes >= LEAST_VIEWS]
     restored[missing] = hull[missing]
     return restored
 
 
-def _uncovered_pixels(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], view: ShapeView
-) -> NDArray[np.bool_]:
+def _uncovered_pixels(guide: Guide, view: ShapeView) -> NDArray[np.bool_]:
     """``(S, S)`` the pixels of a view's mask that a surface leaves uncovered, more than a few pixels off."""
-    T = torch.from_numpy(view.T_cam_obj[None]).float()
-    K = torch.from_numpy(view.K[None]).float()
-    screen, depth = project(torch.from_numpy(vertices).float(), T[:, :3, :3], T[:, :3, 3], K)
-    size = view.mask.shape
-    drawn = rasterize(screen, depth, torch.from_numpy(faces), (size[0], size[1])).face_index[0].numpy() >= 0
+    depth, _ = guide.visible_to(view)
     around = np.ones((2 * _TOLERANCE + 1,) * 2, np.uint8)
-    return view.mask & (cv2.dilate(drawn.astype(np.uint8), around) == 0)
+    return view.mask & (cv2.dilate(np.isfinite(depth).astype(np.uint8), around) == 0)

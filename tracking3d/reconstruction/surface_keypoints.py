@@ -42,7 +42,7 @@ class SurfaceKeypoints:
     length: float
 
 
-def keep_different(kept: Sequence[SurfaceKeypoints], T_cam_obj: NDArray[np.float64]) -> bool:
+def shows_other_side(kept: Sequence[SurfaceKeypoints], T_cam_obj: NDArray[np.float64]) -> bool:
     """Whether a frame with a pose ``(4, 4)`` shows something that the frames at hand do not."""
     if len(kept) >= _MOST:
         return False
