@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
 from tracking3d.reconstruction.unseen_closing import close_unseen, pull_into
 
 SIDE = 64
@@ -87,3 +88,17 @@ def test_a_moved_model_is_closed_alike():
     np.testing.assert_allclose(
         close_unseen(moved).vertices, 3 * close_unseen(model).vertices + (5, -2, 1), atol=1e-9
     )
+
+
+def test_a_speck_that_is_taken_for_seen_holds_nothing():
+    mesh, seen = balloon()
+    far = int(np.argmin(mesh.triangles_center.sum(1)))
+    closed = close_unseen(model_of(mesh, seen | (np.arange(len(seen)) == far)))
+    assert trimesh.Trimesh(closed.vertices, closed.faces).volume == pytest.approx(8 * 5 / 6, rel=0.03)
+
+
+def test_with_a_plane_of_symmetry_the_hull_is_that_of_both_halves():
+    mesh, seen = balloon()
+    plane = SymmetryPlane(np.array([1.0, 0, 0]), 0.0, 1.0)
+    closed = close_unseen(model_of(mesh, seen), [plane])
+    assert trimesh.Trimesh(closed.vertices, closed.faces).volume == pytest.approx(8, rel=0.03)

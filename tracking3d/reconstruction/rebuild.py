@@ -142,7 +142,7 @@ def reshape_run(
         return ShapedRun(model, len(textures), False, made.sentence)
     report_progress("unwrapping the surface")
     made_model = replace_shape(online, made.vertices, made.faces, views.shapes)
-    model = close_unseen(bake_texture(made_model, views.textures, largest))
+    model = close_unseen(bake_texture(made_model, views.textures, largest), made.planes)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)

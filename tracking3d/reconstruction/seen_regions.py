@@ -11,11 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 FloatArray = NDArray[np.float32]
 _ROUNDS = 6  # of averaging over adjacent faces
 _SEEN = 0.5  # share of a region's texels
+_SMALLEST = 0.01  # share of what was seen, below which a region is a speck
 _TEXELS_AT_ONCE = 1 << 16
 
 
@@ -33,10 +35,7 @@ def smooth_seen_share(
         share: ``(F,)`` in [0, 1].
         known: ``(F,)`` faces that have a share, since they have a texel; others take that of the faces around them.
     """
-    corners = vertices[faces]
-    area = (
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-12
-    )
+    area = _areas(vertices, faces)
     adjacent = _adjacent_faces(faces)
     weight = area if known is None else area * known
     total = weight * share
@@ -45,6 +44,24 @@ def smooth_seen_share(
         share = np.where(weight > 0, total / np.maximum(weight, 1e-300), 0.0)
         total, weight = area * share, area * (weight > 0)
     return share
+
+
+def select_large_regions(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], seen: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """``(F,)`` the faces that were seen and belong to a region of some size: a speck is rather an error.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        seen: ``(F,)`` whether a face was seen.
+    """
+    at = np.flatnonzero(seen)
+    _, region = connected_components(_adjacent_faces(faces)[at][:, at], directed=False)
+    area = np.bincount(region, _areas(vertices, faces)[at])
+    large = np.zeros(len(faces), bool)
+    large[at] = (area >= _SMALLEST * area.sum())[region]
+    return large
 
 
 def select_seen_texels(
@@ -124,6 +141,12 @@ def _membrane(
     filled = values.copy()
     filled[free] = spsolve(matrix[free][:, free].tocsc(), right).reshape(-1, 3)
     return filled
+
+
+def _areas(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Twice the area ``(F,)`` of each face, never 0."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-12)
 
 
 def _adjacent_faces(faces: NDArray[np.int64]) -> csr_array:

@@ -27,6 +27,8 @@ from tracking3d.reconstruction.meshing import (
     main_pieces,
     simplify,
 )
+from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
+from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
 from tracking3d.reconstruction.plane_sweep import Guide, depth_maps
 from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
@@ -62,6 +64,7 @@ class ReconstructedShape:
         sentence: What was found, or why the old shape stays.
         old: How the old shape explains the frames that were left out; None if it was not asked.
         new: How the new one does.
+        planes: The planes of symmetry by which unseen parts of the new shape were completed.
     """
 
     vertices: NDArray[np.float64] | None
@@ -69,6 +72,7 @@ class ReconstructedShape:
     sentence: str
     old: HeldOutScore | None = None
     new: HeldOutScore | None = None
+    planes: Sequence[SymmetryPlane] = ()
 
 
 def reconstruct_shape(
@@ -91,7 +95,7 @@ def reconstruct_shape(
         return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
     report_progress("carving the hull")
     vertices, faces = starts[0]
-    grid, inside = _volume(starts, used)
+    grid, inside, planes = _volume(starts, used)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
     if mesh is None:
@@ -109,13 +113,13 @@ def reconstruct_shape(
     )
     if not new.better_than(old):
         return _keep_mesh(f"the new one is no better ({comparison})", old, new)
-    return ReconstructedShape(new_vertices, new_faces, comparison, old, new)
+    return ReconstructedShape(new_vertices, new_faces, comparison, old, new, planes)
 
 
 def _volume(
     starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], views: Sequence[ShapeView]
-) -> tuple[Grid, FloatArray]:
-    """All evidence in a volume, positive inside."""
+) -> tuple[Grid, FloatArray, list[SymmetryPlane]]:
+    """All evidence in a volume, positive inside, and the planes by which it was completed."""
     vertices = np.concatenate([points for points, _ in starts])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
@@ -136,7 +140,8 @@ def _volume(
     )
     grid, hull, prior = bounds[_CELLS]
     total, weight = depth_evidence(grid.points, maps, truncation)
-    return grid, fuse_depth(grid.shape, hull, prior, total, weight, truncation)
+    fused = fuse_depth(grid.shape, hull, prior, total, weight, truncation)
+    return grid, *complete_by_symmetry(grid, fused, hull / truncation, references)
 
 
 def _guide(

@@ -3,7 +3,7 @@
 Every view says what it shows of every texel. The views' exposures are brought to one level, and each texel takes the
 mean of what they show, weighted so steeply by how frontally and how sharply a view shows it that one or two decide:
 a mean of many would blur by what poses and shape are off. A view whose colour is far from the others' has little say
-there: a highlight, a hand, something in front.
+there: a highlight, a hand, something in front. Details that are lost all the same are given back in the end.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.seen_regions import select_seen_texels, spread_colours
+from tracking3d.reconstruction.texture_details import restore_details
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
 from tracking3d.rendering.backend import give_threads, threads_kept
@@ -82,6 +83,7 @@ def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) 
     on_surface[texel] = True
     texture = fill_holes(total.reshape(size, size, 3), on_surface.reshape(size, size))
     del total
+    texture = restore_details(model, texture, texels, views, gains)
     np.clip(np.round(np.multiply(texture, 255, out=texture), out=texture), 0, 255, out=texture)
     return replace(
         model,

@@ -7,6 +7,7 @@ five sixths of the box.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,25 +15,32 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.results.unseen_surface import find_seen_vertices
+from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
+from tracking3d.reconstruction.seen_regions import select_large_regions
+from tracking3d.results.unseen_surface import find_seen_faces
 
 _LEAST = 12  # seen vertices that a hull is made of
 
 
-def close_unseen(model: ObjectModel) -> ObjectModel:
+def close_unseen(model: ObjectModel, planes: Sequence[SymmetryPlane] = ()) -> ObjectModel:
     """The model with the vertices that no frame has shown moved into the convex hull of the others.
 
-    They move towards the middle of the hull, until they are on it. Vertices that were seen stay, and so does the whole
-    model if what was seen lies in one plane.
+    They move towards the middle of the hull, until they are on it. Vertices that were seen stay, other than those of
+    specks (`select_large_regions`), and so does the whole model if what was seen lies in one plane.
 
     Args:
         model: The model with the texture that says what was seen.
+        planes: Planes of symmetry: the mirror images of what was seen are in the hull, too.
     """
-    seen = find_seen_vertices(model)
+    seen = np.zeros(len(model.vertices), bool)
+    seen[model.faces[select_large_regions(model.vertices, model.faces, find_seen_faces(model))]] = True
     if seen.all() or np.count_nonzero(seen) < _LEAST:
         return model
+    held = model.vertices[seen]
+    for plane in planes:
+        held = np.concatenate([held, plane.reflect(held)])
     try:
-        hull = ConvexHull(model.vertices[seen])
+        hull = ConvexHull(held)
     except QhullError:
         return model
     middle = hull.points[hull.vertices].mean(0)

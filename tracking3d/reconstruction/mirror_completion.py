@@ -1,0 +1,114 @@
+"""What no frame has shown of a shape, completed by its mirror image where what was seen is symmetric."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from tracking3d.reconstruction.grid import FloatArray, Grid
+from tracking3d.reconstruction.meshing import decimate_roughly, extract_surface, main_pieces
+from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
+from tracking3d.reconstruction.plane_sweep import Guide
+from tracking3d.reconstruction.seen_vertices import seen_vertices
+from tracking3d.reconstruction.shape_views import ShapeView
+
+_FACES, _SAMPLES = 4000, 4000
+_NEAR = 0.015  # of the diagonal: how far around the surface it is known what a view has seen
+_MOST_SEEN = 0.9  # share of the surface from which there is nothing to complete
+_BESIDE = 3.0  # pixels outside a mask from which there is nothing
+
+
+def complete_by_symmetry(
+    grid: Grid, inside: FloatArray, hull: FloatArray, views: Sequence[ShapeView]
+) -> tuple[FloatArray, list[SymmetryPlane]]:
+    """A shape, with its mirror images added where no view has looked.
+
+    Args:
+        grid: Where.
+        inside: ``(N,)`` signed distance of the shape, positive inside.
+        hull: ``(N,)`` signed distance from the visual hull, in the same unit: nothing is added outside.
+        views: The frames.
+
+    Returns:
+        ``(N,)`` signed distance, and the planes of symmetry; none if what was seen supports none.
+    """
+    found = extract_surface(grid, inside)
+    if found is None:
+        return inside, []
+    mesh = decimate_roughly(main_pieces(found), _FACES)
+    known = _Known.of(mesh, views)
+    points, normals, share = _seen_samples(mesh, views)
+    if share > _MOST_SEEN:
+        return inside, []
+    planes = find_symmetry_planes(points, normals, known.is_free)
+    for plane in planes:
+        inside = _add_image(grid, inside, hull, plane, known)
+    return inside, planes
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What the views have seen: their surface's depths ``(S, S)``, and within which distance of it that is certain."""
+
+    views: Sequence[ShapeView]
+    depths: Sequence[NDArray[np.float32]]
+    near: float
+
+    @classmethod
+    def of(cls, mesh: trimesh.Trimesh, views: Sequence[ShapeView]) -> _Known:
+        guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
+        diagonal = float(np.linalg.norm(np.ptp(guide.vertices, axis=0)))
+        return cls(views, [guide.visible_to(view)[0] for view in views], _NEAR * diagonal)
+
+    def is_free(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """``(N,)`` whether a view sees past points ``(N, 3)``: before the surface, or beside the object."""
+        return self._is_before(points, -self.near)
+
+    def is_seen(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """``(N,)`` whether points ``(N, 3)`` are free, or near to a surface that a view sees."""
+        return self._is_before(points, self.near)
+
+    def _is_before(self, points: NDArray[np.floating], behind: float) -> NDArray[np.bool_]:
+        before = np.zeros(len(points), bool)
+        for view, depth in zip(self.views, self.depths, strict=True):
+            P = view.P.astype(np.float32)
+            x, y, z = P[:, :3] @ points.T.astype(np.float32) + P[:, 3:]
+            z = np.maximum(z, 1e-6)
+            column, row = np.rint(x / z).astype(int), np.rint(y / z).astype(int)
+            looked = (column >= 0) & (row >= 0) & (column < len(depth)) & (row < len(depth))
+            at = row.clip(0, len(depth) - 1), column.clip(0, len(depth) - 1)
+            hit = np.isfinite(depth[at]) & (z < depth[at] + behind)
+            before |= looked & (hit | (view.depth_inside[at] < -_BESIDE))
+        return before
+
+
+def _seen_samples(
+    mesh: trimesh.Trimesh, views: Sequence[ShapeView]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Points ``(N, 3)`` spread over what was seen of a surface, their normals, and what share of it that is."""
+    seen = seen_vertices(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64), views)
+    points, face = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+    shown = np.asarray(seen[mesh.faces].all(1))[face]
+    return np.asarray(points)[shown], np.asarray(mesh.face_normals)[face][shown], float(shown.mean())
+
+
+def _add_image(
+    grid: Grid, inside: FloatArray, hull: FloatArray, plane: SymmetryPlane, known: _Known
+) -> FloatArray:
+    """The shape with its mirror image where that is within the hull and no view has looked."""
+    asked = np.flatnonzero((hull > 0) & (inside < hull))
+    points = grid.points[asked]
+    images = (plane.reflect(points.astype(np.float64)) - grid.origin) / grid.spacing
+    image = map_coordinates(
+        inside.reshape(grid.shape), images.T, order=1, mode="constant", cval=float(inside.min())
+    )
+    larger = np.flatnonzero(image > inside[asked])
+    added = larger[~known.is_seen(points[larger])]
+    completed = inside.copy()
+    completed[asked[added]] = np.minimum(image[added], hull[asked[added]])
+    return completed
