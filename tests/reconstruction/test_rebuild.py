@@ -159,7 +159,7 @@ def test_the_contact_sheet_shows_the_new_mesh_and_the_same_crops(tmp_path, monke
 def test_the_notes_speak_of_the_new_mesh(tmp_path, monkeypatch):
     run = written(tmp_path)
     path = run / "run.json"
-    stale = "90 % of the mesh's surface was never seen; its shape there is a guess"
+    stale = "90 % of the mesh's surface was never seen and is a guess"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"notes": [stale]}))
     retexture_run(run)
     assert stale not in json.loads(path.read_text())["notes"]

@@ -138,7 +138,8 @@ def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
     share = unseen_share(mostly)
     assert 0.6 < share < 0.85
     assert describe_camera_and_model({"assumed": False, "origin": ""}, mostly) == [
-        f"{100 * share:.0f} % of the mesh's surface was never seen; its shape there is a guess"
+        f"{100 * share:.0f} % of the mesh's surface was never seen and is a guess; film its other sides in a second "
+        "video, and add them by --object RUN --extend"
     ]
 
 

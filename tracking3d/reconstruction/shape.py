@@ -90,16 +90,23 @@ def reconstruct_shape(
     """
     used = spread_by_rotation(views, _APART, MOST)
     if len(used) < FEWEST or not left_out:
-        return _keep_mesh(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
+        return _keep_mesh(
+            f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed; film it from more sides"
+        )
     if (turn := largest_turn(np.stack([view.T_cam_obj[:3, :3] for view in used]))) < LEAST_TURN:
-        return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
+        return _keep_mesh(
+            f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed; film it turning further"
+        )
     report_progress("carving the hull")
     vertices, faces = starts[0]
     grid, inside, planes = _volume(starts, used)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
     if mesh is None:
-        return _keep_mesh("what is seen contradicts itself: the new surface is full of holes")
+        return _keep_mesh(
+            "masks and poses contradict each other, so that the new surface is full of holes; better masks help, "
+            "for instance with --tracker segment"
+        )
     new_faces = np.asarray(mesh.faces, np.int64)
     report_progress("fitting outlines")
     new_vertices = fit_to_outlines(

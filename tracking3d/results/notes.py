@@ -56,7 +56,10 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
         )
     unseen = unseen_share(model) if model is not None else 0.0
     if unseen > MOSTLY:
-        notes.append(f"{100 * unseen:.0f} % of the mesh's surface was never seen; its shape there is a guess")
+        notes.append(
+            f"{100 * unseen:.0f} % of the mesh's surface was never seen and is a guess; film its other sides in a "
+            "second video, and add them by --object RUN --extend"
+        )
     return notes
 
 
