@@ -134,7 +134,7 @@ def format_live(report: LiveReport) -> Table:
 
 
 def _session(config: PipelineConfig, frame: Frame, box: Box) -> Session:
-    return Session(config, make_prompt(frame, box))
+    return Session(config, make_prompt(frame, box), live=True)
 
 
 def _to_and_fro(images: list[np.ndarray], length: int) -> Iterator[Frame]:

@@ -7,7 +7,7 @@ data: a frame that cannot be estimated is answered with a status and a reason, n
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +125,19 @@ class ExtendingSolver(Protocol, Generic[State]):
 
     def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
         """The state that refines frames from other poses ``(4, 4)`` than the causal ones, by frame index."""
+        ...
+
+
+@runtime_checkable
+class LiveSolver(Protocol, Generic[State]):
+    """A solver that can do long work in another thread, so that a live source's frames do not wait for it."""
+
+    def for_live_source(self) -> Self:
+        """The same solver for a live source; what it comes to then depends on how fast the machine is."""
+        ...
+
+    def finish_background_work(self, state: State) -> State:
+        """The state with what is still computed in other threads; waits for it."""
         ...
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any, Generic
+from typing import Any, Generic, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from tracking3d.estimation.solver import (
     ContinuingSolver,
     ExtendingSolver,
     GuidedSolver,
+    LiveSolver,
     RefiningSolver,
     Solver,
     State,
@@ -51,6 +52,15 @@ class UndistortingSolver(Generic[State]):
         """See `Solver.step`."""
         state, estimate = self._solver.step(state, self._frame(frame), self._mask(mask))
         return state, self._answer(estimate, mask)
+
+    def for_live_source(self) -> Self:
+        """See `LiveSolver.for_live_source`."""
+        live = isinstance(self._solver, LiveSolver)
+        return type(self)(self._lens, self._solver.for_live_source()) if live else self
+
+    def finish_background_work(self, state: State) -> State:
+        """See `LiveSolver.finish_background_work`."""
+        return self._solver.finish_background_work(state) if isinstance(self._solver, LiveSolver) else state
 
     def result(self, state: State) -> ObjectModel:
         """See `Solver.result`."""

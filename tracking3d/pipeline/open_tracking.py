@@ -159,9 +159,9 @@ def open_tracking(request: TrackRequest, earlier: Path | None = None) -> Iterato
         made = prompts.make(first, request.config.tracker.name)
         config, choice = _select_tracker(request, first, made[0], earlier)
         encoder = build_encoder(config) if len(made) > 1 else None
-        lens = source.intrinsics, source.intrinsics_origin
+        lens, live = (source.intrinsics, source.intrinsics_origin), not source.repeatable
         objects = tuple(
-            TrackedObject(Session(config, prompt, *lens, encoder), prompt, corrections)
+            TrackedObject(Session(config, prompt, *lens, encoder, live=live), prompt, corrections)
             for prompt, corrections in zip(made, request.corrections, strict=True)
         )
         indices = known_indices(source)

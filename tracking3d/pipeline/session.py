@@ -13,7 +13,7 @@ from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
-from tracking3d.estimation.solver import GuidedSolver, Solver
+from tracking3d.estimation.solver import GuidedSolver, LiveSolver, Solver
 from tracking3d.estimation.tracker_feedback import corrects
 from tracking3d.estimation.trusted_masks import with_initial_mask
 from tracking3d.estimation.undistortion import undistort_solver
@@ -51,6 +51,8 @@ class Session(SessionRefinement):
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
         encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
+        live: Whether frames come as they are filmed and do not wait: long work is then done in another thread, and what
+            it comes to depends on how fast the machine is.
 
     Attributes:
         config: The pipeline.
@@ -72,13 +74,14 @@ class Session(SessionRefinement):
         intrinsics: tuple[float, float, float, float] | None = None,
         intrinsics_origin: str = "",
         encoder: FeatureEncoder | None = None,
+        live: bool = False,
     ) -> None:
         check_session(config, prompt, intrinsics)
         self._known = load_known_object(config)
         runtime = config.runtime
         self.renderer = select_renderer(runtime)
         self.config = config
-        self._prompt = prompt
+        self._prompt, self._live = prompt, live
         self._intrinsics = intrinsics, intrinsics_origin
         self._settings = IsolatedRuntime(self.renderer, runtime.device, runtime.seed)
         self._replaying = IsolatedRuntime(self.renderer, runtime.device, runtime.seed)
@@ -155,7 +158,8 @@ class Session(SessionRefinement):
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, FrameOrder(first.index), first.index
         solver = build_solver(self.config, self._camera, self._encoder, self._known)
-        return undistort_solver(self._camera.lens, solver)
+        solver = undistort_solver(self._camera.lens, solver)
+        return solver.for_live_source() if self._live and isinstance(solver, LiveSolver) else solver
 
     @property
     def state_classes(self) -> tuple[type, ...]:
@@ -165,6 +169,9 @@ class Session(SessionRefinement):
 
     def state_dict(self) -> dict[str, Any]:
         """The immutable state that another session continues from, see `load_state_dict`."""
+        if self._live and isinstance(self._solver, LiveSolver):
+            with self._settings.in_force():
+                self._state = self._solver.finish_background_work(self._state)
         return {
             "solver": self._state,
             "camera": self._camera,

@@ -11,7 +11,7 @@ from online_runs import Run, estimate_of, final
 from online_runs import solver as small_solver
 
 from tracking3d.config.solvers import OnlineConfig
-from tracking3d.estimation.online import first_estimates, solver
+from tracking3d.estimation.online import first_estimates, map_initialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverState
@@ -44,7 +44,7 @@ def late_start(monkeypatch):
         _, start = try_initialize(replace(state, pending=state.pending[:SOLVED]), config, ended=True)
         return state, start
 
-    monkeypatch.setattr(solver, "try_initialize", wait)
+    monkeypatch.setattr(map_initialization, "try_initialize", wait)
 
 
 def run_clip() -> Run:

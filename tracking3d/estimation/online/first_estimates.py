@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
@@ -13,13 +16,16 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyfra
 from tracking3d.estimation.online.masks.frame_estimates import learn_colours, make_estimate
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose
-from tracking3d.estimation.online.state.object_map import Keyframe
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
 from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, fit_pose, pose_evidence
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
+
+_LAST = "last"  # name of the pose of the frame before, see `pose_predictions`
 
 
 def estimate_pending_frames(
@@ -45,20 +51,76 @@ def estimate_pending_frames(
     """
     poses = {view.index: view.pose for view in state.object_map.keyframes}
     first = state.object_map.keyframes[0]
-    last = max(poses)
-    pose, usual, revised, trail = first.pose, state.baseline, list[FrameEstimate](), []
+    state, revised, trail = _estimate_in_turn(
+        state, waiting, (first.pose, first.index), poses, start.origin, before, config, weights
+    )
+    return replace(state, previous_pose=trail[-2]), revised
+
+
+def estimate_arrived_frames(
+    state: SolverState,
+    arrived: Sequence[tuple[Keyframe, FrameEstimate]],
+    before: Camera,
+    config: OnlineConfig,
+    weights: PoseWeights,
+) -> tuple[SolverState, list[FrameEstimate]]:
+    """Estimate frames that came while the first map was computed, in the same way.
+
+    Args:
+        state: The state with the map, after the frame before them.
+        arrived: The frames, at least one, and the estimates that they had.
+        before: The camera that they waited with.
+        config: The solver's options.
+        weights: Weights of a pose's cost terms.
+    """
+    names = max(int(view.points.landmark.max(initial=-1)) for view, _ in arrived) + 1
+    state = replace(state, object_map=_with_room(state.object_map, names), previous_pose=state.last_pose)
+    state, revised, trail = _estimate_in_turn(
+        state, arrived, state.last_pose, {}, _LAST, before, config, weights
+    )
+    trajectory = (*state.trajectory, *trail)[-TRAJECTORY_LENGTH:]
+    return replace(state, trajectory=trajectory, previous_pose=trajectory[-2]), revised
+
+
+def _estimate_in_turn(
+    state: SolverState,
+    waiting: Sequence[tuple[Keyframe, FrameEstimate]],
+    known: tuple[Pose, int],
+    poses: Mapping[int, Pose],
+    origin: str,
+    before: Camera,
+    config: OnlineConfig,
+    weights: PoseWeights,
+) -> tuple[SolverState, list[FrameEstimate], list[tuple[Pose, int]]]:
+    """Estimate frames one after the other, each from the pose of the one before.
+
+    Args:
+        state: The state with the map.
+        waiting: The frames, and the estimates that they had.
+        known: A pose and the index of its frame; it stays if that is one of the frames.
+        poses: The poses of frames that the map was made from, by index.
+        origin: What the first poses come from.
+        before: The camera that the frames waited with.
+        config: The solver's options.
+        weights: Weights of a pose's cost terms.
+
+    Returns:
+        The state, the estimates, and the frames' poses and indices.
+    """
+    (pose, fixed), usual, revised, trail = known, state.baseline, list[FrameEstimate](), []
+    last = max(poses, default=fixed)
     for seen, earlier in waiting:
         view = with_focal_length(seen, before, state.camera)
         if state.object_map.pointless:
             view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
         assert state.surface is not None
-        starts = {start.origin: poses.get(view.index, pose)}
+        starts = {origin: poses.get(view.index, pose)}
         fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
-        if view.index == first.index:
-            fit = replace(fit, pose=starts[start.origin])
+        if view.index == fixed:
+            fit = replace(fit, pose=starts[origin])
         kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
         evidence = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
-        found = PoseCandidate(view, fit, start.origin, kept, evidence, assess_pose(fit, usual, evidence))
+        found = PoseCandidate(view, fit, origin, kept, evidence, assess_pose(fit, usual, evidence))
         if view.index > last and _is_new(state, found, config):
             state = _with_keyframe(state, found, config)
             found = replace(found, fit=replace(fit, pose=state.object_map.keyframes[-1].pose))
@@ -71,9 +133,19 @@ def estimate_pending_frames(
         revised.append(estimate)
         state = learn_colours(state, revised[-1], found)
     return replace(
-        state, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]),
-        baseline=usual, tracked_points=view.points,
-    ), revised  # fmt: skip
+        state, last_pose=trail[-1], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]), baseline=usual,
+        tracked_points=view.points,
+    ), revised, trail  # fmt: skip
+
+
+def _with_room(object_map: ObjectMap, names: int) -> ObjectMap:
+    """The map with landmarks whose places are not known, so that there are so many."""
+    more = max(names - len(object_map.landmarks), 0)
+    return replace(
+        object_map,
+        landmarks=np.concatenate([object_map.landmarks, np.full((more, 3), np.nan)]),
+        candidate=np.concatenate([object_map.candidate, np.zeros(more, bool)]),
+    )
 
 
 def _is_new(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> bool:

@@ -47,18 +47,15 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     needs_second_map,
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.first_estimates import estimate_pending_frames
-from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
-from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.initialization.initializer import try_initialize
+from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
-from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points, refine_local_map
+from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points
 from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
-from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
-from tracking3d.estimation.online.masks.mask_agreement import mask_agreement, measure_mask_agreement
+from tracking3d.estimation.online.masks.mask_agreement import mask_agreement
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
@@ -76,15 +73,10 @@ from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.rendering import TexelMap
-from tracking3d.runtime.stage_times import in_stage
-
-_LOOKS_FLAT = (
-    "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
-)
 
 
 @dataclass(frozen=True)
-class OnlineSolver(MapExtension):
+class OnlineSolver(MapInitialization):
     """The solver `online`; implements all protocols of `tracking3d.estimation.solver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
@@ -151,6 +143,7 @@ class OnlineSolver(MapExtension):
 
     def refine(self, state: SolverState) -> SolverState:
         """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
+        state = self.finish_background_work(state)
         if state.phase is SolverPhase.INITIALIZING:
             state, start = try_initialize(state, self.online, ended=True)
             if start is None:
@@ -213,56 +206,13 @@ class OnlineSolver(MapExtension):
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
+        state = self.finish_background_work(state)
         if state.inactive_maps:
             state = activate_largest_map(state)
         object_map = state.object_map
         if not object_map.keyframes:
             object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
         return object_model(object_map, state.surface or object_map.surface())
-
-    def _add_pending(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> tuple[SolverState, FrameEstimate]:
-        """Add a frame to the pending ones, and initialize the map if they show enough motion."""
-        assert state.pending is not None
-        pose = state.last_pose[0]
-        view = self._view(state, frame, mask, pose, follow(state.grey, image, state.tracked_points))
-        object_map, view = add_pending_frame(
-            state.object_map, tuple(v for v, _ in state.pending), view, image
-        )
-        estimate = initial_estimate(frame, mask, pose, state.camera)
-        updated = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
-        with in_stage("map"):
-            updated, start = try_initialize(
-                updated.advanced(pose, frame.index, image, view.points), self.online
-            )
-        if start is None:
-            reason = updated.waiting_reason or estimate.reason
-            return updated, replace(estimate, reason=reason)
-        return self._initialize(updated, start)
-
-    def _initialize(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
-        """Make the first map, and estimate all pending frames with it."""
-        assert state.pending is not None
-        everything = list(range(len(start.object_map.keyframes)))
-        waiting, before, camera = state.pending, state.camera, start.camera
-        with in_stage("map"):
-            object_map = refine_local_map(
-                start.object_map, camera, everything, self.online, bundle_iterations=20, rounds=3
-            )
-            updated = replace(
-                state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
-            )
-            updated = refine_by_landmarks(updated, self.online)
-            if self.config.has_given_masks:
-                updated = measure_mask_agreement(updated)
-            updated, revised = estimate_pending_frames(
-                updated, waiting, start, before, self.online, self.weights
-            )
-        estimate = replace(revised[-1], revised=tuple(revised[:-1]))
-        if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
-            estimate = replace(estimate, reason=_LOOKS_FLAT)
-        return updated, estimate
 
     def _recover(
         self, state: SolverState, estimate: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]

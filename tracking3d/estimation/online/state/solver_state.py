@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import Surface
 from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
+
+if TYPE_CHECKING:
+    from tracking3d.estimation.online.background_initialization import BackgroundInitialization
 
 
 class SolverPhase(Enum):
@@ -106,6 +110,8 @@ class SolverState:
         mask_agreement: How far the initial masks of the keyframes agree with each other.
         extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
             explain, by frame index.
+        background: The initialization that is computed in another thread, if there is one; see
+            `tracking3d.estimation.online.map_initialization`.
     """
 
     camera: Camera
@@ -136,6 +142,7 @@ class SolverState:
     reversal_attempt: tuple[int, float] = (0, 0.0)
     mask_agreement: MaskAgreement = MaskAgreement()
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    background: BackgroundInitialization | None = None
 
     @property
     def phase(self) -> SolverPhase:

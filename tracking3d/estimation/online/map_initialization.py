@@ -1,0 +1,151 @@
+"""Frames wait until they show enough motion for a first map, and are then estimated with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.background_initialization import BackgroundInitialization, Pending
+from tracking3d.estimation.online.features.klt import follow
+from tracking3d.estimation.online.first_estimates import estimate_arrived_frames, estimate_pending_frames
+from tracking3d.estimation.online.initialization.initial_map import InitialMap
+from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
+from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
+from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
+from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.frames import Frame
+from tracking3d.runtime.stage_times import in_stage
+
+_LOOKS_FLAT = (
+    "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
+)
+_IN_PROGRESS = "the first map is being computed"
+_AT_ONCE = 0.03
+"""Seconds that an attempt in the background is waited for: most find at once that the motion is too small."""
+
+
+@dataclass(frozen=True)
+class MapInitialization(MapExtension):
+    """Makes the first map.
+
+    Attributes:
+        in_background: Whether the first map is computed in another thread; what it comes to then depends on the
+            machine.
+    """
+
+    in_background: bool = field(default=False, kw_only=True)
+
+    def for_live_source(self) -> Self:
+        """The solver for a source that does not wait; see `tracking3d.estimation.solver.LiveSolver`."""
+        return replace(self, in_background=True)
+
+    def finish_background_work(self, state: SolverState) -> SolverState:
+        """The state when what is computed in the background is done; see `for_live_source`."""
+        begun = state.background
+        if begun is None or not begun.is_done(wait=None):
+            return state
+        return self._take_over(state, begun)[0]
+
+    def _add_pending(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> tuple[SolverState, FrameEstimate]:
+        """Add a frame to the pending ones, and initialize the map if they show enough motion."""
+        assert state.pending is not None
+        pose = state.last_pose[0]
+        view = self._view(state, frame, mask, pose, follow(state.grey, image, state.tracked_points))
+        object_map, view = add_pending_frame(
+            state.object_map, tuple(v for v, _ in state.pending), view, image
+        )
+        estimate = initial_estimate(frame, mask, pose, state.camera)
+        updated = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
+        updated = updated.advanced(pose, frame.index, image, view.points)
+        if self.in_background:
+            return self._initialize_beside(updated, (view, estimate))
+        updated, found = self._try_to_initialize(updated)
+        return updated, self._waiting(updated, estimate) if found is None else found
+
+    def _try_to_initialize(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """Initialize the map if the pending frames determine it; None if they do not."""
+        with in_stage("map"):
+            state, start = try_initialize(state, self.online)
+        return (state, None) if start is None else self._initialize(state, start)
+
+    def _initialize(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
+        """Make the first map, and estimate all pending frames with it."""
+        assert state.pending is not None
+        everything = list(range(len(start.object_map.keyframes)))
+        waiting, before, camera = state.pending, state.camera, start.camera
+        with in_stage("map"):
+            object_map = refine_local_map(
+                start.object_map, camera, everything, self.online, bundle_iterations=20, rounds=3
+            )
+            updated = replace(
+                state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
+            )
+            updated = refine_by_landmarks(updated, self.online)
+            if self.config.has_given_masks:
+                updated = measure_mask_agreement(updated)
+            updated, revised = estimate_pending_frames(
+                updated, waiting, start, before, self.online, self.weights
+            )
+        estimate = replace(revised[-1], revised=tuple(revised[:-1]))
+        if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
+            estimate = replace(estimate, reason=_LOOKS_FLAT)
+        return updated, estimate
+
+    def _initialize_beside(self, state: SolverState, newest: Pending) -> tuple[SolverState, FrameEstimate]:
+        """Initialize the map in another thread; the frame keeps its initial mask until that is done."""
+        begun = state.background
+        if begun is None:
+            begun = BackgroundInitialization(
+                partial(self._try_to_initialize, state),
+                partial(estimate_arrived_frames, before=state.camera, config=self.online, weights=self.weights),
+            )  # fmt: skip
+            state, wait = replace(state, background=begun), _AT_ONCE
+        else:
+            begun.add(newest)
+            wait = 0.0
+        if not begun.is_done(wait):
+            return state, replace(newest[1], reason=_IN_PROGRESS)
+        state, found = self._take_over(state, begun)
+        return state, self._waiting(state, newest[1]) if found is None else found
+
+    def _take_over(
+        self, state: SolverState, begun: BackgroundInitialization
+    ) -> tuple[SolverState, FrameEstimate | None]:
+        """The state with what came of an initialization, as if no frame had come meanwhile."""
+        outcome = begun.outcome()
+        found, estimates = outcome.state, outcome.estimates
+        if not estimates:
+            assert found.pending is not None
+            at_rest = found.object_map.started_at_rest
+            return replace(
+                state,
+                object_map=replace(state.object_map, started_at_rest=at_rest),
+                pending=(*found.pending, *outcome.left),
+                next_attempt=found.next_attempt,
+                ambiguous_frames=found.ambiguous_frames,
+                ambiguous_rotation=found.ambiguous_rotation,
+                waiting_reason=found.waiting_reason,
+                background=None,
+            ), None
+        if outcome.left:
+            found, more = estimate_arrived_frames(
+                found, outcome.left, before=state.camera, config=self.online, weights=self.weights
+            )
+            estimates = [*estimates, *more]
+        found = replace(found, grey=state.grey, background=None)
+        return found, replace(estimates[-1], revised=tuple(estimates[:-1]))
+
+    @staticmethod
+    def _waiting(state: SolverState, estimate: FrameEstimate) -> FrameEstimate:
+        """The estimate of a pending frame, with the reason why it waits."""
+        return replace(estimate, reason=state.waiting_reason or estimate.reason)
