@@ -27,8 +27,10 @@ _REACH = 2.5  # of the tolerance, along the surface: points on it are so dense
 _SAME_NORMAL = 0.9  # cosine
 _PAIRS = 4000  # that are drawn
 _SCREENED, _TESTED = 120, 1500  # points that screen the planes, and that test the best of them
-_CANDIDATES = 12  # planes that are refined
-_SLIDE, _OFFSETS = 6.0, 49  # how far a plane is slid along its normal, in tolerances, and in how many steps
+_CANDIDATES = 8  # planes that are refined
+_LEAST_SCREENED = 0.3  # their support at first
+_SLIDE, _OFFSETS = 6.0, 33  # how far a plane is slid along its normal, in tolerances, and in how many steps
+_SLID = 700  # points that say which offset is best
 _AS_GOOD = 0.005  # difference in support
 _SAME_PLANE, _MOST_PLANES = 0.9, 3  # cosine between the normals of two planes that count as one
 _NEARLY_SAME_PLANE = 0.985  # the same before planes are refined
@@ -80,7 +82,7 @@ def find_symmetry_planes(
     candidates = _distinct(planes, support)
     for normal, offset in candidates:
         normal, offset = surface.refine(tested, normal, offset)
-        offset = surface.centre(tested, normal, offset)
+        offset = surface.centre(tested[:_SLID], normal, offset)
         share = surface.support(tested, normal, offset)
         elsewhere = tested[~surface.matches(tested, normal, offset)]
         contradicted = is_free(_reflect(points[elsewhere], normal, offset)).sum() / len(tested)
@@ -120,7 +122,7 @@ class _Surface:
 
     def refine(self, asked: NDArray[np.int64], normal: FloatArray, offset: float) -> tuple[FloatArray, float]:
         """The plane near a plane for which mirror images are nearest to the surface's tangent planes."""
-        for _ in range(3):
+        for _ in range(2):
             matched = asked[self.matches(asked, normal, offset)]
             if len(matched) < 10:
                 break
@@ -178,7 +180,7 @@ def _distinct(
     kept: list[tuple[FloatArray, float]] = []
     for place in np.argsort(-support, kind="stable"):
         normal, offset = planes[place]
-        if len(kept) == _CANDIDATES:
+        if len(kept) == _CANDIDATES or support[place] < _LEAST_SCREENED:
             break
         if all(abs(normal @ other) < _NEARLY_SAME_PLANE for other, _ in kept):
             kept.append((normal, offset))
