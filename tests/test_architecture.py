@@ -47,6 +47,7 @@ ONLINE_FLOORS = [
     {"continued_refinement"},
     {"frame_mapping"},
     {"map_extension"},
+    {"map_initialization"},
     {"user_guidance"},
     {"solver"},
     {"known_object"},

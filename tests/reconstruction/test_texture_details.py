@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from rendered_views import FINE, ball, pattern, view
 
-from tracking3d.reconstruction.texture_details import restore_details
+from tracking3d.reconstruction import texture_details
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap
 
@@ -18,6 +18,12 @@ YAWS = (-30, -15, 0, 15, 30)
 MODEL = ball()
 TEXELS = TexelMap.of(torch.from_numpy(MODEL.face_uvs).float(), FINE)
 GAINS = [np.ones(3, np.float32)] * len(YAWS)
+
+
+def restore_details(model, texture, *rest) -> NDArray[np.float32]:
+    """With the colours last, as pictures have them."""
+    planes = np.ascontiguousarray(texture.transpose(2, 0, 1))
+    return texture_details.restore_details(model, planes, *rest).transpose(1, 2, 0)
 
 
 def views(texture: NDArray[np.float32] | None = None) -> list[TextureView]:

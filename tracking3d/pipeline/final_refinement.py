@@ -150,6 +150,11 @@ class FinalRefinement:
                 self._estimates.put_mask(index, mask)
 
     @property
+    def records(self) -> Iterable[FrameRecord]:
+        """The estimates as they are now."""
+        return self._estimates.all()
+
+    @property
     def decides_masks(self) -> bool:
         """Whether the frames are to come once for `collect_mask` before they are drawn."""
         return self._last.masks is not None

@@ -154,7 +154,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         _run_last_passes(source, active)
         for recording in active:
             with active.guard(recording):
-                recording.finish()
+                recording.finish(source)
 
 
 def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:

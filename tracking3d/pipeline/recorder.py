@@ -23,6 +23,7 @@ from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture, close_unseen
+from tracking3d.reconstruction.final_shape import is_reconstructed
 from tracking3d.results.initial_masks import is_initial_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -279,13 +280,16 @@ class ObjectRecorder:
         self._writer.draw_again(frame)
         return None
 
-    def finish(self) -> None:
-        """Write the final files."""
+    def finish(self, source: FrameSource) -> None:
+        """Write the final files; ``source`` is the video."""
         model, largest = self._session.result(), self._session.config.object.max_texture_size
         if self.refinement is not None:
             self.refinement.draw_rest()
             self._work.wait()
-            model = close_unseen(bake_texture(*self.refinement.final_model(), largest))
+            surface, views = self.refinement.final_model()
+            # A new shape gets a texture of its own.
+            details = not is_reconstructed(self.refinement.records, self._session.config, source)
+            model = close_unseen(bake_texture(surface, views, largest, details))
             self._writer.end_refinement()
             self._causal_model = None
         report_progress("writing the model")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,28 +10,29 @@ import numpy as np
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.source import FrameSource
 
 
-def can_reconstruct(folder: Path, config: PipelineConfig, source: FrameSource) -> bool:
-    """Whether a new shape is worth trying: packages and frames are there, and the object turns enough.
+def is_reconstructed(records: Iterable[FrameRecord], config: PipelineConfig, source: FrameSource) -> bool:
+    """Whether ``object.shape`` asks for a new shape, and with ``auto`` whether packages, frames and motion allow it.
 
     Args:
-        folder: The run folder.
+        records: The final estimates.
         config: Config of the run.
         source: Its video.
     """
     from tracking3d.reconstruction.rebuild import has_packages
     from tracking3d.reconstruction.shape import FEWEST, LEAST_TURN, largest_turn
 
+    if config.object.shape != "auto" or config.object.extends is not None:
+        return config.object.shape == "fine" or config.object.extends is not None
     if not (config.solver.final_refine and config.object.texture_views and source.repeatable):
         return False
     rotations = [
-        record.T_cam_obj[:3, :3]
-        for record in RunReader(folder).frames
-        if record.refined and record.status is Status.TRACKED
+        record.T_cam_obj[:3, :3] for record in records if record.refined and record.status is Status.TRACKED
     ]
     return has_packages() and len(rotations) >= FEWEST and largest_turn(np.stack(rotations)) >= LEAST_TURN
 
@@ -59,8 +61,8 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
         return sentence
     from tracking3d.reconstruction.rebuild import rebuild_shape  # slow to import, and only needed at the end
 
-    wanted = config.object.shape == "fine" or always
-    if not wanted and not (config.object.shape == "auto" and can_reconstruct(folder, config, source)):
+    records = RunReader(folder).frames if config.object.shape == "auto" and not always else ()
+    if not (always or is_reconstructed(records, config, source)):
         return ""
     if source.repeatable:
         try:

@@ -38,17 +38,17 @@ def restore_details(
 
     Args:
         model: The surface, with its texture coordinates.
-        texture: ``(T, T, 3)`` colours in [0, 1].
+        texture: ``(3, T, T)`` colours in [0, 1]; changed.
         texels: Its texels on the surface.
         views: Frames with poses of this model.
         gains: ``(3,)`` factors for the colours of each view.
 
     Returns:
-        ``(T, T, 3)`` in [0, 1].
+        ``(3, T, T)`` in [0, 1], the same array.
     """
     surface = torch.from_numpy(model.vertices).float(), torch.from_numpy(model.faces)
-    face_uvs, colours = torch.from_numpy(model.face_uvs).float(), torch.from_numpy(texture).permute(2, 0, 1)
-    total, weight = np.zeros((texture.size // 3, 3), np.float32), np.zeros(texture.size // 3, np.float32)
+    face_uvs, colours = torch.from_numpy(model.face_uvs).float(), torch.from_numpy(texture)
+    total, weight = np.zeros((3, texture[0].size), np.float32), np.zeros(texture[0].size, np.float32)
     sharpest = max((view.sharpness for view in views), default=0.0) or 1.0
     for view, gain in zip(views, gains, strict=True):
         R = torch.from_numpy(view.T_cam_obj[:3, :3]).float()
@@ -61,10 +61,13 @@ def restore_details(
         layers = torch.from_numpy(difference).permute(2, 0, 1)
         seen = seen_texels(layers, torch.from_numpy(valid), *surface, texels, R, t, K)
         texel, share = seen.texel.numpy(), seen.weight.numpy() * np.float32(view.sharpness / sharpest)
-        total[texel] += share[:, None] * seen.values.numpy().T
+        for channel, values in zip(total, seen.values.numpy(), strict=True):
+            channel[texel] += share * values
         weight[texel] += share
-    total /= np.maximum(weight, 1e-12)[:, None]
-    return np.clip(texture + total.reshape(texture.shape), 0, 1)
+    for channel, added in zip(texture, total, strict=True):
+        channel += (added / np.maximum(weight, 1e-12)).reshape(channel.shape)
+        np.clip(channel, 0, 1, out=channel)
+    return texture
 
 
 def _fast_difference(difference: NDArray[np.floating], valid: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,6 @@ from online_runs import solver as waiting_solver
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.online import map_initialization
-from tracking3d.estimation.online.background_initialization import BackgroundInitialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
@@ -156,26 +155,6 @@ def test_an_error_in_the_other_thread_is_raised_in_the_next_frame(monkeypatch):
     monkeypatch.setattr(map_initialization, "_AT_ONCE", PATIENCE)
     with pytest.raises(ValueError, match="something is wrong"):
         take(range(2))
-
-
-def test_of_many_frames_some_are_caught_up_with_and_the_newest_always(held):
-    caught: list[list[int]] = []
-
-    def catch_up(state, some):
-        caught.append(list(some))
-        return state, list(some)
-
-    job = BackgroundInitialization(lambda: (held.wait(PATIENCE), _Estimate())[1:] * 2, catch_up)
-    for number in range(30):
-        job.add(number)
-    held.set()
-    assert job.is_done(PATIENCE)
-    assert len(caught) == 1 and len(caught[0]) == 10 and caught[0][-1] == 29
-    assert job.outcome().left == []
-
-
-class _Estimate:
-    revised = ()
 
 
 def test_a_session_of_a_live_source_uses_it(monkeypatch):

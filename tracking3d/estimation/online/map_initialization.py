@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.online.background_initialization import BackgroundInitialization, Pending
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.first_estimates import estimate_arrived_frames, estimate_pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -20,14 +19,18 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local
 from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
 from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
+from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
+from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.runtime.stage_times import in_stage
 
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
 _IN_PROGRESS = "the first map is being computed"
+Pending = tuple[Keyframe, FrameEstimate]
+"""A frame that waits for the first map, and its estimate so far."""
 _AT_ONCE = 0.03
 """Seconds that an attempt in the background is waited for: most find at once that the motion is too small."""
 
@@ -105,8 +108,8 @@ class MapInitialization(MapExtension):
         """Initialize the map in another thread; the frame keeps its initial mask until that is done."""
         begun = state.background
         if begun is None:
-            begun = BackgroundInitialization(
-                partial(self._try_to_initialize, state),
+            begun = BackgroundAttempt(
+                partial(self._attempt_beside, state),
                 partial(estimate_arrived_frames, before=state.camera, config=self.online, weights=self.weights),
             )  # fmt: skip
             state, wait = replace(state, background=begun), _AT_ONCE
@@ -118,12 +121,17 @@ class MapInitialization(MapExtension):
         state, found = self._take_over(state, begun)
         return state, self._waiting(state, newest[1]) if found is None else found
 
+    def _attempt_beside(self, state: SolverState) -> tuple[SolverState, list[FrameEstimate]]:
+        """The state after an attempt, and the estimates of all pending frames; none if there is no map."""
+        state, found = self._try_to_initialize(state)
+        return state, [] if found is None else [*found.revised, found]
+
     def _take_over(
-        self, state: SolverState, begun: BackgroundInitialization
+        self, state: SolverState, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
     ) -> tuple[SolverState, FrameEstimate | None]:
         """The state with what came of an initialization, as if no frame had come meanwhile."""
         outcome = begun.outcome()
-        found, estimates = outcome.state, outcome.estimates
+        found, estimates = outcome.state, outcome.results
         if not estimates:
             assert found.pending is not None
             at_rest = found.object_map.started_at_rest

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,9 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import Surface
+from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
-
-if TYPE_CHECKING:
-    from tracking3d.estimation.online.background_initialization import BackgroundInitialization
 
 
 class SolverPhase(Enum):
@@ -142,7 +140,7 @@ class SolverState:
     reversal_attempt: tuple[int, float] = (0, 0.0)
     mask_agreement: MaskAgreement = MaskAgreement()
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    background: BackgroundInitialization | None = None
+    background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
     def phase(self) -> SolverPhase:

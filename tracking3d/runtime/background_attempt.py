@@ -1,0 +1,103 @@
+"""Long work in another thread, which then catches up with what has come meanwhile.
+
+The first map of a live source takes seconds. Frames that come meanwhile are kept, some of them are worked off in the
+same thread until it is only a few behind, and then the thread of the caller goes on with the result.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+State = TypeVar("State")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_FEW = 2  # items that are left to the caller's thread in the end
+_ONE_IN, _MOST = 3, 10  # of the items that came, one in so many is worked off, and so many at most at a time
+
+
+@dataclass(frozen=True, eq=False)
+class AttemptOutcome(Generic[State, Item, Result]):
+    """What came of an attempt.
+
+    Attributes:
+        state: The state after it.
+        results: Of the items that were worked off, in order; empty if the attempt failed.
+        left: The items that came since.
+    """
+
+    state: State
+    results: list[Result]
+    left: list[Item]
+
+
+class BackgroundAttempt(Generic[State, Item, Result]):
+    """An attempt that runs in a thread of its own from the beginning.
+
+    Args:
+        attempt: The long work: gives a state, and the results so far; none if it fails.
+        catch_up: Works off some of the items that came since, the newest always among them, from a state on.
+    """
+
+    def __init__(
+        self,
+        attempt: Callable[[], tuple[State, list[Result]]],
+        catch_up: Callable[[State, Sequence[Item]], tuple[State, list[Result]]],
+    ) -> None:
+        self._attempt, self._catch_up = attempt, catch_up
+        self._arrived: list[Item] = []
+        self._lock = threading.Lock()
+        self._done: Future[tuple[State, list[Result]]] = Future()
+        # No daemon: kernels that run while the interpreter ends abort the process.
+        threading.Thread(target=self._work, name="tracking3d-background").start()
+
+    def add(self, item: Item) -> None:
+        """One more has come."""
+        with self._lock:
+            self._arrived.append(item)
+
+    def is_done(self, wait: float | None = 0.0) -> bool:
+        """Whether the outcome is there, after at most so many seconds; with None it is waited for."""
+        wait_for([self._done], wait)
+        return self._done.done()
+
+    def outcome(self) -> AttemptOutcome[State, Item, Result]:
+        """What came of it, when it is done.
+
+        Raises:
+            Exception: What the other thread has raised.
+        """
+        state, results = self._done.result()
+        return AttemptOutcome(state, results, self._take())
+
+    def _work(self) -> None:
+        try:
+            self._done.set_result(self._run())
+        except BaseException as error:  # raised where the outcome is asked for
+            self._done.set_exception(error)
+
+    def _run(self) -> tuple[State, list[Result]]:
+        state, results = self._attempt()
+        if not results:
+            return state, []
+        while some := self._take(more_than=_FEW):
+            count = min(-(-len(some) // _ONE_IN), _MOST)
+            places = np.linspace(len(some) / count, len(some), count).round().astype(int) - 1
+            state, more = self._catch_up(state, [some[place] for place in places])
+            results = [*results, *more]
+        return state, results
+
+    def _take(self, more_than: int = 0) -> list[Item]:
+        """The items that have come; none if they are not more than so many."""
+        with self._lock:
+            if len(self._arrived) <= more_than:
+                return []
+            taken, self._arrived = self._arrived, []
+        return taken
