@@ -34,6 +34,8 @@ from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
+_PROVISIONAL = 512
+"""Most texels along a side of a texture that the one of the final shape replaces."""
 
 
 class ObjectRecorder:
@@ -287,9 +289,9 @@ class ObjectRecorder:
             self.refinement.draw_rest()
             self._work.wait()
             surface, views = self.refinement.final_model()
-            # A new shape gets a texture of its own.
-            details = not is_reconstructed(self.refinement.records, self._session.config, source)
-            model = close_unseen(bake_texture(surface, views, largest, details))
+            replaced = is_reconstructed(self.refinement.records, self._session.config, source)
+            largest = min(largest, _PROVISIONAL) if replaced else largest
+            model = close_unseen(bake_texture(surface, views, largest, details=not replaced))
             self._writer.end_refinement()
             self._causal_model = None
         report_progress("writing the model")
