@@ -25,7 +25,7 @@ def session(monkeypatch):
     made = SimpleNamespace(seconds=0.0, frames=[], prompt=None)
 
     class Timed:
-        def __init__(self, config, prompt):
+        def __init__(self, config, prompt, live):
             made.prompt = prompt
 
         def step(self, frame):

@@ -53,7 +53,7 @@ def script(monkeypatch) -> Script:
         state_classes = ()
         corrected = replays = False
 
-        def __init__(self, config, prompt, intrinsics=None, intrinsics_origin="", encoder=None):
+        def __init__(self, config, prompt, intrinsics=None, intrinsics_origin="", encoder=None, live=False):
             script.built.append((config, prompt))
             self.config = config
             self.can_refine, self.initial_mask = False, MaskEstimate(None)

@@ -246,7 +246,7 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
     used: list[PipelineConfig] = []
 
     class Recorder:
-        def __init__(self, config, prompt, intrinsics, origin, encoder):
+        def __init__(self, config, prompt, intrinsics, origin, encoder, live):
             used.append(config)
 
         def step(self, frame):
