@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from tracking3d.reconstruction.shape_views import ShapeView
 _FACES, _SAMPLES = 4000, 4000
 _NEAR = 0.015  # of the diagonal: how far around the surface it is known what a view has seen
 _MOST_SEEN = 0.9  # share of the surface from which there is nothing to complete
-_BESIDE = 3.0  # pixels outside a mask from which there is nothing
+_BESIDE = 2  # pixels around the silhouette that may be the object's or not
 
 
 def complete_by_symmetry(
@@ -53,7 +54,14 @@ def complete_by_symmetry(
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What the views have seen: their surface's depths ``(S, S)``, and within which distance of it that is certain."""
+    """What the views have seen.
+
+    Attributes:
+        views: The frames.
+        depths: ``(S, S)`` depth of the surface in each: infinite beside the object, where all that is seen is beyond
+            it, and minus infinite in a narrow band around its silhouette, which may be the one or the other.
+        near: Within which distance of the surface that is certain.
+    """
 
     views: Sequence[ShapeView]
     depths: Sequence[NDArray[np.float32]]
@@ -63,7 +71,12 @@ class _Known:
     def of(cls, mesh: trimesh.Trimesh, views: Sequence[ShapeView]) -> _Known:
         guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
         diagonal = float(np.linalg.norm(np.ptp(guide.vertices, axis=0)))
-        return cls(views, [guide.visible_to(view)[0] for view in views], _NEAR * diagonal)
+        depths = [guide.visible_to(view)[0] for view in views]
+        around = np.ones((2 * _BESIDE + 1,) * 2, np.uint8)
+        for depth in depths:
+            covered = np.isfinite(depth)
+            depth[(cv2.dilate(covered.astype(np.uint8), around) > 0) & ~covered] = -np.inf
+        return cls(views, depths, _NEAR * diagonal)
 
     def is_free(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """``(N,)`` whether a view sees past points ``(N, 3)``: before the surface, or beside the object."""
@@ -82,8 +95,7 @@ class _Known:
             column, row = np.rint(x / z).astype(int), np.rint(y / z).astype(int)
             looked = (column >= 0) & (row >= 0) & (column < len(depth)) & (row < len(depth))
             at = row.clip(0, len(depth) - 1), column.clip(0, len(depth) - 1)
-            hit = np.isfinite(depth[at]) & (z < depth[at] + behind)
-            before |= looked & (hit | (view.depth_inside[at] < -_BESIDE))
+            before |= looked & (z < depth[at] + behind)
         return before
 
 
