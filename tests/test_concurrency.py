@@ -8,7 +8,13 @@ from functools import partial
 
 import pytest
 
-from tracking3d.runtime.concurrency import BackgroundWriter, OrderedExecutor, read_ahead, with_next
+from tracking3d.runtime.concurrency import (
+    BackgroundWriter,
+    OrderedExecutor,
+    begin_beside,
+    read_ahead,
+    with_next,
+)
 
 
 def test_items_come_in_order_from_another_thread():
@@ -127,3 +133,21 @@ def test_an_error_of_one_of_several_jobs_comes_in_its_turn():
     assert list(jobs.do(lambda: 2)) == [0]
     with pytest.raises(ValueError, match="job 1"):
         list(jobs.rest())
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_job_beside_gives_its_result_or_raises_when_it_is_asked(threads):
+    where = []
+
+    def job() -> int:
+        where.append(threading.current_thread())
+        return 7
+
+    assert begin_beside(job, threads)() == 7
+    assert (where[0] is threading.current_thread()) == (threads == 1)
+
+
+def test_an_error_of_a_job_beside_is_raised_when_its_result_is_asked_for():
+    result = begin_beside(lambda: 1 / 0, 2)
+    with pytest.raises(ZeroDivisionError):
+        result()

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
 from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
 from tracking3d.reconstruction.visual_hull import carve_hull
+from tracking3d.runtime.concurrency import begin_beside
 from tracking3d.runtime.progress import report_progress
 
 FEWEST = 8
@@ -99,6 +102,7 @@ def reconstruct_shape(
         )
     report_progress("carving the hull")
     vertices, faces = starts[0]
+    scored = begin_beside(partial(score_held_out, vertices, faces, used, left_out), cv2.getNumThreads())
     grid, inside, planes = _volume(starts, used)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
@@ -112,7 +116,7 @@ def reconstruct_shape(
     new_vertices = fit_to_outlines(
         np.asarray(mesh.vertices), new_faces, spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
     )
-    old = score_held_out(vertices, faces, used, left_out)
+    old = scored()
     new = score_held_out(new_vertices, new_faces, used, left_out)
     comparison = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
@@ -134,9 +138,9 @@ def _volume(
     references = spread_by_rotation(views, _REFERENCES_APART, _REFERENCES)
     for cells in (_COARSE, _CELLS):
         grid = Grid.around(vertices, cells, _MARGIN)
+        measured = begin_beside(partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads())
         hull, _ = carve_hull(grid.points, views, 2 * truncation)
-        distances = [mesh_distance(grid, points, faces, 1.2 * truncation) for points, faces in starts]
-        prior = np.maximum.reduce(distances)  # what one video has not shown is often missing from its shape
+        prior = measured()
         bounds[cells] = grid, hull, restore_uncovered(grid, hull, prior, references)
     maps = depth_maps(
         views,
@@ -149,6 +153,13 @@ def _volume(
     total, weight = depth_evidence(grid.points, maps, truncation)
     fused = fuse_depth(grid.shape, hull, prior, total, weight, truncation)
     return grid, *complete_by_symmetry(grid, fused, hull / truncation, references)
+
+
+def _start_distance(
+    grid: Grid, starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], far: float
+) -> FloatArray:
+    """``(N,)`` signed distance from the shapes at hand; what one video has not shown is often missing from its own."""
+    return np.maximum.reduce([mesh_distance(grid, points, faces, far) for points, faces in starts])
 
 
 def _guide(

@@ -52,6 +52,25 @@ def with_next(items: Iterable[T]) -> Generator[tuple[T, T | None]]:
         item = after
 
 
+def begin_beside(job: Callable[[], T], threads: int) -> Callable[[], T]:
+    """Begin a job in another thread, if there may be more than one; gives what waits for its result.
+
+    Args:
+        job: Does not depend on what the caller does meanwhile.
+        threads: How many threads there may be; with one the job is done at once.
+
+    Returns:
+        Gives the result, or raises what the job ended with.
+    """
+    if threads <= 1:
+        result = job()
+        return lambda: result
+    thread = ThreadPoolExecutor(1, "tracking3d-beside")
+    running = thread.submit(job)
+    thread.shutdown(wait=False)
+    return running.result
+
+
 class OrderedExecutor:
     """Jobs that do not depend on each other, done several at a time; what they give comes in their order.
 
