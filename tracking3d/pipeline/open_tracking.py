@@ -28,7 +28,7 @@ from tracking3d.prompts.prompt import PromptSet, damaged_start_error
 from tracking3d.results.layout import RUN
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.both_ways import check_start_frame
-from tracking3d.video.source import FrameSource, known_indices
+from tracking3d.video.source import FrameSource, is_live, known_indices
 
 _log = logging.getLogger(__name__)
 
@@ -159,7 +159,7 @@ def open_tracking(request: TrackRequest, earlier: Path | None = None) -> Iterato
         made = prompts.make(first, request.config.tracker.name)
         config, choice = _select_tracker(request, first, made[0], earlier)
         encoder = build_encoder(config) if len(made) > 1 else None
-        lens, live = (source.intrinsics, source.intrinsics_origin), not source.repeatable
+        lens, live = (source.intrinsics, source.intrinsics_origin), is_live(source)
         objects = tuple(
             TrackedObject(Session(config, prompt, *lens, encoder, live=live), prompt, corrections)
             for prompt, corrections in zip(made, request.corrections, strict=True)

@@ -80,6 +80,11 @@ class LatestFrames:
         return source_notes(self.source)
 
     @property
+    def live(self) -> bool:
+        """Frames do not wait."""
+        return True
+
+    @property
     def repeatable(self) -> bool:
         """Never: other frames would be dropped."""
         return False

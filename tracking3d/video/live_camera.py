@@ -34,6 +34,7 @@ class LiveCamera:
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
     repeatable: bool = False
+    live: bool = True
 
     @classmethod
     def open(cls, number: int, selection: range = EVERY_FRAME) -> LiveCamera:

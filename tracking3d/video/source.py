@@ -61,6 +61,11 @@ def source_notes(source: FrameSource) -> tuple[str, ...]:
     return tuple(getattr(source, "notes", ()))
 
 
+def is_live(source: FrameSource) -> bool:
+    """Whether a source's frames do not wait until they are taken; a source that is live says so by ``live``."""
+    return bool(getattr(source, "live", False))
+
+
 def known_indices(source: FrameSource) -> Collection[int] | None:
     """Indices of the frames that a source will give; None if it does not know them before its end.
 

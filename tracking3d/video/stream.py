@@ -107,6 +107,7 @@ class LiveStream:
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
     repeatable: bool = False
+    live: bool = True
     notes: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
