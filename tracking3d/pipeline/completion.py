@@ -8,7 +8,7 @@ from pathlib import Path
 from tracking3d.checkpoint.integrity import RunIntegrity
 from tracking3d.config.models import PipelineConfig
 from tracking3d.pipeline.frame_reading import read_again
-from tracking3d.reconstruction.final_shape import make_final_shape
+from tracking3d.reconstruction.final_shape import is_reconstructed, make_final_shape
 from tracking3d.results import layout
 from tracking3d.results.artefacts import PICTURES, missing_files
 from tracking3d.results.mesh_export import export_mesh, load_model, restore_texture
@@ -53,8 +53,8 @@ def complete_run(folder: Path, config: PipelineConfig, source: FrameSource) -> N
         OutputError: If something cannot be written.
     """
     missing = missing_files(folder, (*layout.MESH_FILES, *PICTURES))
-    wanted = config.object.shape == "fine" or config.object.extends is not None
-    shapeless = wanted and "shape" not in RunReader(folder).description
+    run = RunReader(folder)
+    shapeless = "shape" not in run.description and is_reconstructed(run.frames, config, source)
     if missing or shapeless:
         names = [*missing, *(["the shape from all frames"] if shapeless else [])]
         _log.warning(_MADE_AGAIN, folder, ", ".join(names))

@@ -289,7 +289,11 @@ class ObjectRecorder:
             self.refinement.draw_rest()
             self._work.wait()
             surface, views = self.refinement.final_model()
-            replaced = is_reconstructed(self.refinement.records, self._session.config, source)
+            config = (
+                self._session.config
+            )  # with `fine` and `extends` it is not sure that there will be a new shape
+            replaced = config.object.shape == "auto" and config.object.extends is None
+            replaced = replaced and is_reconstructed(self.refinement.records, config, source)
             largest = min(largest, _PROVISIONAL) if replaced else largest
             model = close_unseen(bake_texture(surface, views, largest, details=not replaced))
             self._writer.end_refinement()

@@ -152,7 +152,7 @@ def reshape_run(
 
 
 def restore_online_mesh(folder: Path) -> bool:
-    """Make the mesh of the online map that of the run again, with the texture that it had then.
+    """Make the mesh of the online map that of the run again, with the texture that it had then, which may be coarse.
 
     Returns:
         Whether a reconstructed shape was replaced; otherwise the mesh is that of the online map, and stays as it is.
