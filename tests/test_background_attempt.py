@@ -67,3 +67,12 @@ def test_an_error_is_raised_where_the_outcome_is_asked_for():
     assert work.is_done(PATIENCE)
     with pytest.raises(ValueError, match="something is wrong"):
         work.outcome()
+
+
+def test_the_outcome_is_the_same_if_it_is_asked_again():
+    released = threading.Event()
+    work = BackgroundAttempt(lambda: after(released, -1), lambda state, some: (state, []))
+    work.add(0)
+    released.set()
+    assert work.is_done(PATIENCE)
+    assert work.outcome().left == work.outcome().left == [0]

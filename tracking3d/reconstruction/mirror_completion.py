@@ -95,7 +95,7 @@ class _Known:
             column, row = np.rint(x / z).astype(int), np.rint(y / z).astype(int)
             looked = (column >= 0) & (row >= 0) & (column < len(depth)) & (row < len(depth))
             at = row.clip(0, len(depth) - 1), column.clip(0, len(depth) - 1)
-            before |= looked & (z < depth[at] + behind)
+            before |= looked & view.in_frame[at] & (z < depth[at] + behind)
         return before
 
 

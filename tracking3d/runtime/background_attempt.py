@@ -68,14 +68,20 @@ class BackgroundAttempt(Generic[State, Item, Result]):
         wait_for([self._done], wait)
         return self._done.done()
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether the other thread has raised an error."""
+        return self._done.done() and self._done.exception() is not None
+
     def outcome(self) -> AttemptOutcome[State, Item, Result]:
-        """What came of it, when it is done.
+        """What came of it, when it is done; the same if it is asked again.
 
         Raises:
             Exception: What the other thread has raised.
         """
         state, results = self._done.result()
-        return AttemptOutcome(state, results, self._take())
+        with self._lock:
+            return AttemptOutcome(state, results, list(self._arrived))
 
     def _work(self) -> None:
         try:

@@ -19,7 +19,9 @@ from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverS
 from tracking3d.estimation.solver import LiveSolver
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.prompt import make_prompt
+from tracking3d.runtime.background_attempt import BackgroundAttempt
 
+is_done = BackgroundAttempt.is_done
 PATIENCE = 120.0
 """Seconds until a test fails because a thread hangs."""
 
@@ -168,3 +170,20 @@ def test_a_session_of_a_live_source_uses_it(monkeypatch):
         session.step(frame(0))
         assert getattr(session._solver, "in_background") is live  # noqa: B009
     assert not seen
+
+
+def test_after_an_error_there_is_still_an_object_made_of_the_pending_frames(monkeypatch):
+    run = take(range(1))
+
+    def fail(state: SolverState, config: OnlineConfig, ended: bool = False) -> None:
+        raise ValueError("something is wrong")
+
+    monkeypatch.setattr(map_initialization, "try_initialize", fail)
+    monkeypatch.setattr(map_initialization, "_AT_ONCE", 0.0)
+    state, _ = run
+    monkeypatch.setattr(
+        BackgroundAttempt, "is_done", lambda self, wait=0.0: wait is None and is_done(self, wait)
+    )
+    state, _ = solver().step(state, frame(1), estimate_of(true_mask(1)))
+    assert state.background is not None
+    assert len(solver().result(state).vertices) > 0

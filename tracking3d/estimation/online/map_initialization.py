@@ -55,7 +55,7 @@ class MapInitialization(MapExtension):
         begun = state.background
         if begun is None or not begun.is_done(wait=None):
             return state
-        return self._take_over(state, begun)[0]
+        return replace(state, background=None) if begun.has_failed else self._take_over(state, begun)[0]
 
     def _add_pending(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
