@@ -75,6 +75,9 @@ def script(monkeypatch) -> Script:
         def load_state_dict(self, first, kept, failures):
             self.camera = Camera.from_fov(first.size[1], first.size[0])
 
+        def finish_background_work(self):
+            return []
+
         def failure_at(self, index):
             return ""
 

@@ -136,8 +136,13 @@ class LiveSolver(Protocol, Generic[State]):
         """The same solver for a live source; what it comes to then depends on how fast the machine is."""
         ...
 
-    def finish_background_work(self, state: State) -> State:
-        """The state with what is still computed in other threads; waits for it."""
+    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
+        """Wait for what is still computed in other threads.
+
+        Returns:
+            The state with its result, and an estimate of the last frame with those of earlier frames in ``revised``;
+            None if there is nothing new.
+        """
         ...
 
 

@@ -58,9 +58,12 @@ class UndistortingSolver(Generic[State]):
         live = isinstance(self._solver, LiveSolver)
         return type(self)(self._lens, self._solver.for_live_source()) if live else self
 
-    def finish_background_work(self, state: State) -> State:
+    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
         """See `LiveSolver.finish_background_work`."""
-        return self._solver.finish_background_work(state) if isinstance(self._solver, LiveSolver) else state
+        if not isinstance(self._solver, LiveSolver):
+            return state, None
+        state, found = self._solver.finish_background_work(state)
+        return state, None if found is None else self._answer(found)
 
     def result(self, state: State) -> ObjectModel:
         """See `Solver.result`."""

@@ -202,6 +202,9 @@ class ObjectRecorder:
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: refine everything, or record why not though it was asked for."""
         self._unmet.warn()
+        for late in self._session.finish_background_work():
+            self._writer.record(late, "", revision=True)
+            self._writer.use_camera(self._session.camera)
         self._state.save()
         estimates = self._open_refinement(source)
         if estimates is not None:

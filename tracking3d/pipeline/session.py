@@ -98,6 +98,7 @@ class Session(SessionRefinement):
         self.coming: Frame | None = None
         self._last_pose = self._first_pose = np.eye(4)
         self._failures: dict[int, str] = {}
+        self._late: list[FrameEstimate] = []
         self._refined = False
         self.refining = StageTimes()
 
@@ -169,9 +170,7 @@ class Session(SessionRefinement):
 
     def state_dict(self) -> dict[str, Any]:
         """The immutable state that another session continues from, see `load_state_dict`."""
-        if self._live and isinstance(self._solver, LiveSolver):
-            with self._settings.in_force():
-                self._state = self._solver.finish_background_work(self._state)
+        self._late += self._finish_background_work()
         return {
             "solver": self._state,
             "camera": self._camera,
@@ -183,6 +182,26 @@ class Session(SessionRefinement):
             "random": self._settings.random,
             "tracker": self._tracker.state(),
         }
+
+    def finish_background_work(self) -> list[FrameEstimate]:
+        """Wait for what a live session still computes; call it after the last ``step``.
+
+        Returns:
+            Better estimates of earlier frames, in order; mostly none.
+        """
+        late, self._late = self._late + self._finish_background_work(), []
+        return late
+
+    def _finish_background_work(self) -> list[FrameEstimate]:
+        if not (self._live and isinstance(self._solver, LiveSolver)):
+            return []
+        with self._settings.in_force():
+            self._state, found = self._solver.finish_background_work(self._state)
+        if found is None:
+            return []
+        found = self._presented.index(found)
+        self._last_pose, self._camera = found.T_cam_obj, found.camera or self._camera
+        return [self._with_failure(one) for one in (*found.revised, replace(found, revised=()))]
 
     def load_state_dict(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
         """Restore a saved session (`state_dict`), instead of starting on a first frame.

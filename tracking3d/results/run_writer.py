@@ -144,8 +144,7 @@ class RunWriter:
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
         """Keep the estimate for one frame, and those it revises.
 
-        Overlay and contact sheet show each frame's first estimate, since they are drawn while its image is there;
-        a final refinement redraws them.
+        Overlay and contact sheet show each frame's first estimate; a final refinement redraws them.
 
         Returns:
             The record of ``estimate``.
@@ -155,8 +154,8 @@ class RunWriter:
         """
         started = time.perf_counter() - self._drawing  # of the image before, drawn when its line was safe
         for revised in estimate.revised:
-            self._record(revised, "", revision=True)
-        record = self._record(estimate, frame.name, revision=False, started=started)
+            self.record(revised, "", revision=True)
+        record = self.record(estimate, frame.name, revision=False, started=started)
         self.use_camera(estimate.camera or self._camera)
         drawn = time.perf_counter()
         self._pictures.add(frame, estimate, record)
@@ -292,9 +291,10 @@ class RunWriter:
         self._description["resumed"] = [*earlier.get("resumed", ()), again]
         self._description["skipped"] = [{"index": one.index, "reason": one.reason} for one in so_far.skipped]
 
-    def _record(
+    def record(
         self, estimate: FrameEstimate, name: str, revision: bool, started: float | None = None
     ) -> FrameRecord:
+        """Write an estimate without drawing it; ``revision`` if its frame has one already."""
         initial_path = layout.initial_mask_path(self.folder, estimate.index)
         initial = estimate.initial_mask
         if revision and initial_path.is_file():  # a better estimate has the same initial mask

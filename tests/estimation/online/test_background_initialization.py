@@ -104,11 +104,14 @@ def test_the_solver_goes_on_with_the_map_when_it_has_caught_up(held):
 def test_the_end_waits_for_the_map(held):
     state, _ = begun_run(9)
     held.set()
-    finished = solver().finish_background_work(state)
+    finished, found = solver().finish_background_work(state)
+    assert found is not None
+    known = [*(one.index for one in found.revised), found.index]
+    assert known == sorted(set(known)) and (known[0], known[-1]) == (0, 8)
     assert finished.phase is SolverPhase.TRACKING and finished.background is None
     assert len(finished.object_map.keyframes) > 1
     assert finished.last_pose[1] == 8
-    assert solver().finish_background_work(finished) is finished
+    assert solver().finish_background_work(finished) == (finished, None)
 
 
 def test_nothing_is_kept_of_a_quick_attempt_that_finds_nothing(monkeypatch):
@@ -157,6 +160,18 @@ def test_an_error_in_the_other_thread_is_raised_in_the_next_frame(monkeypatch):
     monkeypatch.setattr(map_initialization, "_AT_ONCE", PATIENCE)
     with pytest.raises(ValueError, match="something is wrong"):
         take(range(2))
+
+
+def test_the_estimates_of_a_map_that_comes_after_the_last_frame_are_given_at_the_end(held):
+    session = Session(waiting_solver().config, make_prompt(frame(0), mask=true_mask(0)), live=True)
+    estimates = [session.step(frame(index)) for index in range(9)]
+    held.set()
+    late = session.finish_background_work()
+    if late:  # otherwise the map was there before, and is in the frames' estimates
+        assert not any(estimate.revised for estimate in estimates)
+        assert [one.index for one in late] == sorted({one.index for one in late}) and late[-1].index == 8
+        assert late[0].status is Status.TRACKED
+    assert session.finish_background_work() == []
 
 
 def test_a_session_of_a_live_source_uses_it(monkeypatch):

@@ -50,12 +50,12 @@ class MapInitialization(MapExtension):
         """The solver for a source that does not wait; see `tracking3d.estimation.solver.LiveSolver`."""
         return replace(self, in_background=True)
 
-    def finish_background_work(self, state: SolverState) -> SolverState:
-        """The state when what is computed in the background is done; see `for_live_source`."""
+    def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """See `tracking3d.estimation.solver.LiveSolver`; an attempt that has failed is given up."""
         begun = state.background
         if begun is None or not begun.is_done(wait=None):
-            return state
-        return replace(state, background=None) if begun.has_failed else self._take_over(state, begun)[0]
+            return state, None
+        return (replace(state, background=None), None) if begun.has_failed else self._take_over(state, begun)
 
     def _add_pending(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None

@@ -143,7 +143,7 @@ class OnlineSolver(MapInitialization):
 
     def refine(self, state: SolverState) -> SolverState:
         """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
-        state = self.finish_background_work(state)
+        state, _ = self.finish_background_work(state)
         if state.phase is SolverPhase.INITIALIZING:
             state, start = try_initialize(state, self.online, ended=True)
             if start is None:
@@ -206,7 +206,7 @@ class OnlineSolver(MapInitialization):
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
-        state = self.finish_background_work(state)
+        state, _ = self.finish_background_work(state)
         if state.inactive_maps:
             state = activate_largest_map(state)
         object_map = state.object_map
