@@ -11,8 +11,8 @@ import pytest
 from tracking3d.runtime.concurrency import (
     BackgroundWriter,
     OrderedExecutor,
-    begin_beside,
     read_ahead,
+    start_in_thread,
     with_next,
 )
 
@@ -143,11 +143,11 @@ def test_a_job_beside_gives_its_result_or_raises_when_it_is_asked(threads):
         where.append(threading.current_thread())
         return 7
 
-    assert begin_beside(job, threads)() == 7
+    assert start_in_thread(job, threads)() == 7
     assert (where[0] is threading.current_thread()) == (threads == 1)
 
 
 def test_an_error_of_a_job_beside_is_raised_when_its_result_is_asked_for():
-    result = begin_beside(lambda: 1 / 0, 2)
+    result = start_in_thread(lambda: 1 / 0, 2)
     with pytest.raises(ZeroDivisionError):
         result()

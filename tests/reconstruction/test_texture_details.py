@@ -74,3 +74,12 @@ def test_what_no_view_shows_stays():
     front = restore_details(MODEL, blurred, TEXELS, [view(0, 0.0)], GAINS[:1])
     behind = restore_details(MODEL, blurred, TEXELS, [back], GAINS[:1])
     assert not (shown(front, blurred) & shown(behind, blurred)).any()
+
+
+def test_threads_change_nothing(monkeypatch):
+    blurred = cv2.GaussianBlur(pattern(), (0, 0), 2.0)
+    found = []
+    for threads in (1, 2):
+        monkeypatch.setattr(texture_details.cv2, "getNumThreads", lambda threads=threads: threads)
+        found.append(restore_details(MODEL, blurred.copy(), TEXELS, views(), GAINS))
+    np.testing.assert_array_equal(*found)

@@ -167,3 +167,9 @@ def test_what_is_continued_goes_around_the_seam_in_u():
 def test_all_or_nothing_known_is_left(known):
     texture = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32)
     assert fill_holes(texture, np.full((8, 8), known)) is texture
+
+
+def test_details_can_be_left_out():
+    views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
+    with_details, without = (bake_texture(ball(), views, details=details) for details in (True, False))
+    assert error(with_details, pattern()) < error(without, pattern())

@@ -133,7 +133,7 @@ class LiveSolver(Protocol, Generic[State]):
     """A solver that can do long work in another thread, so that a live source's frames do not wait for it."""
 
     def for_live_source(self) -> Self:
-        """The same solver for a live source; what it comes to then depends on how fast the machine is."""
+        """The same solver for a live source; the result then depends on how fast the machine is."""
         ...
 
     def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:

@@ -34,7 +34,7 @@ from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
-_PROVISIONAL = 512
+_MAX_PROVISIONAL_SIZE = 512
 """Most texels along a side of a texture that the one of the final shape replaces."""
 
 
@@ -297,7 +297,7 @@ class ObjectRecorder:
             )  # with `fine` and `extends` it is not sure that there will be a new shape
             replaced = config.object.shape == "auto" and config.object.extends is None
             replaced = replaced and is_reconstructed(self.refinement.records, config, source)
-            largest = min(largest, _PROVISIONAL) if replaced else largest
+            largest = min(largest, _MAX_PROVISIONAL_SIZE) if replaced else largest
             model = close_unseen(bake_texture(surface, views, largest, details=not replaced))
             self._writer.end_refinement()
             self._causal_model = None

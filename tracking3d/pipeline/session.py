@@ -51,8 +51,8 @@ class Session(SessionRefinement):
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
         encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
-        live: Whether frames come as they are filmed and do not wait: long work is then done in another thread, and what
-            it comes to depends on how fast the machine is.
+        live: Whether frames come as they are filmed and do not wait: long work is then done in another thread, and
+            the result depends on how fast the machine is.
 
     Attributes:
         config: The pipeline.

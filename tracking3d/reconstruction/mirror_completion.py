@@ -1,4 +1,4 @@
-"""What no frame has shown of a shape, completed by its mirror image where what was seen is symmetric."""
+"""What no frame has shown of a shape is completed by its mirror image if the seen part is symmetric."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tracking3d.reconstruction.shape_views import ShapeView
 
 _FACES, _SAMPLES = 4000, 4000
 _NEAR = 0.015  # of the diagonal: how far around the surface it is known what a view has seen
-_MOST_SEEN = 0.9  # share of the surface from which there is nothing to complete
+_MAX_SEEN = 0.9  # share of the surface from which there is nothing to complete
 _BESIDE = 2  # pixels around the silhouette that may be the object's or not
 
 
@@ -44,7 +44,7 @@ def complete_by_symmetry(
     mesh = decimate_roughly(main_pieces(found), _FACES)
     known = _Known.of(mesh, views)
     points, normals, share = _seen_samples(mesh, views)
-    if share > _MOST_SEEN:
+    if share > _MAX_SEEN:
         return inside, []
     planes = find_symmetry_planes(points, normals, known.is_free)
     for plane in planes:

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 FloatArray = NDArray[np.float64]
 
-LEAST_SUPPORT = 0.5
+MIN_SUPPORT = 0.5
 """Share of the seen surface that a plane has to map onto the seen surface."""
-MOST_CONTRADICTED = 0.03
+MAX_CONTRADICTED = 0.03
 """Share of the seen surface that may be mapped to where frames have seen nothing."""
 _TOLERANCE = 0.012  # of the diagonal, between a mapped point and the surface
 _REACH = 2.5  # of the tolerance, along the surface: points on it are so dense
@@ -28,11 +28,11 @@ _SAME_NORMAL = 0.9  # cosine
 _PAIRS = 4000  # that are drawn
 _SCREENED, _TESTED = 120, 1500  # points that screen the planes, and that test the best of them
 _CANDIDATES = 8  # planes that are refined
-_LEAST_SCREENED = 0.3  # their support at first
+_MIN_SCREENED = 0.3  # their support at first
 _SLIDE, _OFFSETS = 6.0, 33  # how far a plane is slid along its normal, in tolerances, and in how many steps
 _SLID = 700  # points that say which offset is best
 _AS_GOOD = 0.005  # difference in support
-_SAME_PLANE, _MOST_PLANES = 0.9, 3  # cosine between the normals of two planes that count as one
+_SAME_PLANE, _MAX_PLANES = 0.9, 3  # cosine between the normals of two planes that count as one
 _NEARLY_SAME_PLANE = 0.985  # the same before planes are refined
 
 
@@ -75,25 +75,25 @@ def find_symmetry_planes(
     tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
     surface = _Surface(points, normals, cKDTree(points), tolerance)
     screened = generator.choice(len(points), _SCREENED, replace=False)
-    planes = _planes_of_pairs(points, normals, generator)
+    planes = _draw_planes(points, normals, generator)
     support = np.array([surface.support(screened, normal, offset) for normal, offset in planes])
     tested = generator.choice(len(points), min(_TESTED, len(points)), replace=False)
     found: list[SymmetryPlane] = []
-    candidates = _distinct(planes, support)
+    candidates = _select_distinct(planes, support)
     for normal, offset in candidates:
         normal, offset = surface.refine(tested, normal, offset)
         offset = surface.centre(tested[:_SLID], normal, offset)
         share = surface.support(tested, normal, offset)
         elsewhere = tested[~surface.matches(tested, normal, offset)]
         contradicted = is_free(_reflect(points[elsewhere], normal, offset)).sum() / len(tested)
-        if share >= LEAST_SUPPORT and contradicted <= MOST_CONTRADICTED:
+        if share >= MIN_SUPPORT and contradicted <= MAX_CONTRADICTED:
             found.append(SymmetryPlane(normal, offset, share))
     found.sort(key=lambda plane: -plane.support)
     kept: list[SymmetryPlane] = []
     for plane in found:
         if all(abs(plane.normal @ other.normal) < _SAME_PLANE for other in kept):
             kept.append(plane)
-    return kept[:_MOST_PLANES]
+    return kept[:_MAX_PLANES]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _reflect(points: FloatArray, normal: FloatArray, offset: float) -> FloatArra
     return np.asarray(points - 2 * (points @ normal - offset)[:, None] * normal)
 
 
-def _planes_of_pairs(
+def _draw_planes(
     points: FloatArray, normals: FloatArray, generator: np.random.Generator
 ) -> list[tuple[FloatArray, float]]:
     """The planes between the points of random pairs, of those whose normals are mirror images, too."""
@@ -173,14 +173,14 @@ def _planes_of_pairs(
     return [(normal, float(offset)) for normal, offset in zip(between[alike], offsets[alike], strict=True)]
 
 
-def _distinct(
+def _select_distinct(
     planes: list[tuple[FloatArray, float]], support: NDArray[np.float64]
 ) -> list[tuple[FloatArray, float]]:
     """The planes with the largest support, those that are nearly the same as a better one left out."""
     kept: list[tuple[FloatArray, float]] = []
     for place in np.argsort(-support, kind="stable"):
         normal, offset = planes[place]
-        if len(kept) == _CANDIDATES or support[place] < _LEAST_SCREENED:
+        if len(kept) == _CANDIDATES or support[place] < _MIN_SCREENED:
             break
         if all(abs(normal @ other) < _NEARLY_SAME_PLANE for other, _ in kept):
             kept.append((normal, offset))

@@ -36,7 +36,7 @@ from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
 from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
 from tracking3d.reconstruction.visual_hull import carve_hull
-from tracking3d.runtime.concurrency import begin_beside
+from tracking3d.runtime.concurrency import start_in_thread
 from tracking3d.runtime.progress import report_progress
 
 FEWEST = 8
@@ -102,7 +102,7 @@ def reconstruct_shape(
         )
     report_progress("carving the hull")
     vertices, faces = starts[0]
-    scored = begin_beside(partial(score_held_out, vertices, faces, used, left_out), cv2.getNumThreads())
+    scored = start_in_thread(partial(score_held_out, vertices, faces, used, left_out), cv2.getNumThreads())
     grid, inside, planes = _volume(starts, used)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
@@ -138,7 +138,9 @@ def _volume(
     references = spread_by_rotation(views, _REFERENCES_APART, _REFERENCES)
     for cells in (_COARSE, _CELLS):
         grid = Grid.around(vertices, cells, _MARGIN)
-        measured = begin_beside(partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads())
+        measured = start_in_thread(
+            partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads()
+        )
         hull, _ = carve_hull(grid.points, views, 2 * truncation)
         prior = measured()
         bounds[cells] = grid, hull, restore_uncovered(grid, hull, prior, references)

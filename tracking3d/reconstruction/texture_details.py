@@ -1,7 +1,7 @@
 """Fine details of a texture, which the views show and their mean has lost.
 
 Colours are interpolated twice, from a view into the texture and from the texture into an image, and views do not lie
-on each other exactly: what is rendered is more blurred than what was filmed. The difference between each view and what
+on each other exactly: a rendered view is more blurred than the filmed one. The difference between each view and what
 the texture predicts of it is therefore taken back into the texture, as in super-resolution (Irani and Peleg, "Improving
 resolution by image registration", 1991). Slow differences are left out: they are light, not texture.
 """
@@ -25,7 +25,7 @@ from tracking3d.runtime.concurrency import OrderedExecutor
 
 FloatArray = NDArray[np.float32]
 
-_SLOW = 10.0
+_LIGHT_SIGMA = 10.0
 """Pixels over which a difference is light."""
 _AT_A_TIME = 2  # views
 _OTHER_COLOUR = 0.12
@@ -57,7 +57,7 @@ def restore_details(
     sharpest = max((view.sharpness for view in views), default=0.0) or 1.0
     jobs = OrderedExecutor(min(cv2.getNumThreads(), _AT_A_TIME))
     for view, gain in zip(views, gains, strict=True):
-        for done in jobs.do(partial(_missing_details, surface, face_uvs, colours, texels, view, gain)):
+        for done in jobs.do(partial(_find_missing_details, surface, face_uvs, colours, texels, view, gain)):
             _add(total, weight, done, sharpest)
     for done in jobs.rest():
         _add(total, weight, done, sharpest)
@@ -67,7 +67,7 @@ def restore_details(
     return texture
 
 
-def _missing_details(
+def _find_missing_details(
     surface: tuple[Tensor, Tensor],
     face_uvs: Tensor,
     colours: Tensor,
@@ -82,7 +82,7 @@ def _missing_details(
     drawn = render(*surface, face_uvs, colours, R[None], t[None], K[None], size)
     predicted = drawn.image()[0].permute(1, 2, 0).numpy()
     valid = view.valid * (drawn.face_index[0].numpy() >= 0)
-    difference, valid = _fast_difference(view.image * (gain / 255) - predicted, valid)
+    difference, valid = _remove_light(view.image * (gain / 255) - predicted, valid)
     layers = torch.from_numpy(difference).permute(2, 0, 1)
     return view, seen_texels(layers, torch.from_numpy(valid), *surface, texels, R, t, K)
 
@@ -98,12 +98,12 @@ def _add(
     weight[texel] += share
 
 
-def _fast_difference(difference: NDArray[np.floating], valid: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _remove_light(difference: NDArray[np.floating], valid: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A difference ``(S, S, 3)`` without what changes slowly, and how far each of its pixels is the texture's."""
     inside = (valid > 0).astype(np.float32)
     difference = (difference * inside[..., None]).astype(np.float32)
-    slow = cv2.GaussianBlur(difference, (0, 0), _SLOW)
-    slow /= np.maximum(cv2.GaussianBlur(inside, (0, 0), _SLOW), 1e-3)[..., None]
+    slow = cv2.GaussianBlur(difference, (0, 0), _LIGHT_SIGMA)
+    slow /= np.maximum(cv2.GaussianBlur(inside, (0, 0), _LIGHT_SIGMA), 1e-3)[..., None]
     fast = (difference - slow) * inside[..., None]
     agrees = 1 / (1 + np.square(np.abs(fast).max(2) / _OTHER_COLOUR))
     return fast, (valid * agrees).astype(np.float32)

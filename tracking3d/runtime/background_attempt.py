@@ -1,7 +1,7 @@
-"""Long work in another thread, which then catches up with what has come meanwhile.
+"""Long work in another thread, which then catches up with the items that arrived meanwhile.
 
-The first map of a live source takes seconds. Frames that come meanwhile are kept, some of them are worked off in the
-same thread until it is only a few behind, and then the thread of the caller goes on with the result.
+The first map of a live source takes seconds. Frames that arrive meanwhile are queued, and the thread then processes
+every third of them, at most ten at a time, until it is two behind. The caller's thread goes on with the result.
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ State = TypeVar("State")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_FEW = 2  # items that are left to the caller's thread in the end
-_ONE_IN, _MOST = 3, 10  # of the items that came, one in so many is worked off, and so many at most at a time
+_MAX_LEFT = 2  # items that are left to the caller's thread in the end
+_STRIDE, _MAX_BATCH = (
+    3,
+    10,
+)  # every so-manyth of the queued items is processed, and no more than this at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +32,8 @@ class AttemptOutcome(Generic[State, Item, Result]):
 
     Attributes:
         state: The state after it.
-        results: Of the items that were worked off, in order; empty if the attempt failed.
-        left: The items that came since.
+        results: Of the items that were processed, in order; empty if the attempt found nothing.
+        left: The items that arrived since.
     """
 
     state: State
@@ -42,8 +45,8 @@ class BackgroundAttempt(Generic[State, Item, Result]):
     """An attempt that runs in a thread of its own from the beginning.
 
     Args:
-        attempt: The long work: gives a state, and the results so far; none if it fails.
-        catch_up: Works off some of the items that came since, the newest always among them, from a state on.
+        attempt: The long work: gives a state, and the results so far; none if it finds nothing.
+        catch_up: Processes some of the items that arrived since, always with the newest, from a state on.
     """
 
     def __init__(
@@ -59,7 +62,7 @@ class BackgroundAttempt(Generic[State, Item, Result]):
         threading.Thread(target=self._work, name="tracking3d-background").start()
 
     def add(self, item: Item) -> None:
-        """One more has come."""
+        """Queue one more item."""
         with self._lock:
             self._arrived.append(item)
 
@@ -93,15 +96,15 @@ class BackgroundAttempt(Generic[State, Item, Result]):
         state, results = self._attempt()
         if not results:
             return state, []
-        while some := self._take(more_than=_FEW):
-            count = min(-(-len(some) // _ONE_IN), _MOST)
+        while some := self._take(more_than=_MAX_LEFT):
+            count = min(-(-len(some) // _STRIDE), _MAX_BATCH)
             places = np.linspace(len(some) / count, len(some), count).round().astype(int) - 1
             state, more = self._catch_up(state, [some[place] for place in places])
             results = [*results, *more]
         return state, results
 
     def _take(self, more_than: int = 0) -> list[Item]:
-        """The items that have come; none if they are not more than so many."""
+        """The queued items, which are removed; none if they are not more than so many."""
         with self._lock:
             if len(self._arrived) <= more_than:
                 return []

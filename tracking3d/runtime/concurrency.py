@@ -52,7 +52,7 @@ def with_next(items: Iterable[T]) -> Generator[tuple[T, T | None]]:
         item = after
 
 
-def begin_beside(job: Callable[[], T], threads: int) -> Callable[[], T]:
+def start_in_thread(job: Callable[[], T], threads: int) -> Callable[[], T]:
     """Begin a job in another thread, if there may be more than one; gives what waits for its result.
 
     Args:

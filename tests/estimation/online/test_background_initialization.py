@@ -124,7 +124,7 @@ def test_nothing_is_kept_of_a_quick_attempt_that_finds_nothing(monkeypatch):
         return map_initialization.replace(state, waiting_reason="for a reason", next_attempt=0.5), None
 
     monkeypatch.setattr(map_initialization, "try_initialize", find_nothing)
-    monkeypatch.setattr(map_initialization, "_AT_ONCE", PATIENCE)
+    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", PATIENCE)
     state, estimates = take(range(4))
     assert asked == [2, 3, 4]
     assert state.background is None and len(state.pending or ()) == 4
@@ -157,7 +157,7 @@ def test_an_error_in_the_other_thread_is_raised_in_the_next_frame(monkeypatch):
         raise ValueError("something is wrong")
 
     monkeypatch.setattr(map_initialization, "try_initialize", fail)
-    monkeypatch.setattr(map_initialization, "_AT_ONCE", PATIENCE)
+    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", PATIENCE)
     with pytest.raises(ValueError, match="something is wrong"):
         take(range(2))
 
@@ -178,7 +178,9 @@ def test_a_session_of_a_live_source_uses_it(monkeypatch):
     config = waiting_solver().config
     seen = []
     monkeypatch.setattr(
-        map_initialization.MapInitialization, "_initialize_beside", lambda self, state, newest: seen.append(1)
+        map_initialization.MapInitialization,
+        "_initialize_in_background",
+        lambda self, state, newest: seen.append(1),
     )
     for live in (False, True):
         session = Session(config, make_prompt(frame(0), mask=true_mask(0)), live=live)
@@ -194,7 +196,7 @@ def test_after_an_error_there_is_still_an_object_made_of_the_pending_frames(monk
         raise ValueError("something is wrong")
 
     monkeypatch.setattr(map_initialization, "try_initialize", fail)
-    monkeypatch.setattr(map_initialization, "_AT_ONCE", 0.0)
+    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", 0.0)
     state, _ = run
     monkeypatch.setattr(
         BackgroundAttempt, "is_done", lambda self, wait=0.0: wait is None and is_done(self, wait)

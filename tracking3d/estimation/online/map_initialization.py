@@ -31,7 +31,7 @@ _LOOKS_FLAT = (
 _IN_PROGRESS = "the first map is being computed"
 Pending = tuple[Keyframe, FrameEstimate]
 """A frame that waits for the first map, and its estimate so far."""
-_AT_ONCE = 0.03
+_FIRST_WAIT = 0.03
 """Seconds that an attempt in the background is waited for: most find at once that the motion is too small."""
 
 
@@ -40,7 +40,7 @@ class MapInitialization(MapExtension):
     """Makes the first map.
 
     Attributes:
-        in_background: Whether the first map is computed in another thread; what it comes to then depends on the
+        in_background: Whether the first map is computed in another thread; the result then depends on the
             machine.
     """
 
@@ -55,7 +55,7 @@ class MapInitialization(MapExtension):
         begun = state.background
         if begun is None or not begun.is_done(wait=None):
             return state, None
-        return (replace(state, background=None), None) if begun.has_failed else self._take_over(state, begun)
+        return (replace(state, background=None), None) if begun.has_failed else self._adopt(state, begun)
 
     def _add_pending(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
@@ -71,9 +71,9 @@ class MapInitialization(MapExtension):
         updated = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
         updated = updated.advanced(pose, frame.index, image, view.points)
         if self.in_background:
-            return self._initialize_beside(updated, (view, estimate))
+            return self._initialize_in_background(updated, (view, estimate))
         updated, found = self._try_to_initialize(updated)
-        return updated, self._waiting(updated, estimate) if found is None else found
+        return updated, self._with_reason(updated, estimate) if found is None else found
 
     def _try_to_initialize(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
         """Initialize the map if the pending frames determine it; None if they do not."""
@@ -104,29 +104,31 @@ class MapInitialization(MapExtension):
             estimate = replace(estimate, reason=_LOOKS_FLAT)
         return updated, estimate
 
-    def _initialize_beside(self, state: SolverState, newest: Pending) -> tuple[SolverState, FrameEstimate]:
+    def _initialize_in_background(
+        self, state: SolverState, newest: Pending
+    ) -> tuple[SolverState, FrameEstimate]:
         """Initialize the map in another thread; the frame keeps its initial mask until that is done."""
         begun = state.background
         if begun is None:
             begun = BackgroundAttempt(
-                partial(self._attempt_beside, state),
+                partial(self._attempt_in_background, state),
                 partial(estimate_arrived_frames, before=state.camera, config=self.online, weights=self.weights),
             )  # fmt: skip
-            state, wait = replace(state, background=begun), _AT_ONCE
+            state, wait = replace(state, background=begun), _FIRST_WAIT
         else:
             begun.add(newest)
             wait = 0.0
         if not begun.is_done(wait):
             return state, replace(newest[1], reason=_IN_PROGRESS)
-        state, found = self._take_over(state, begun)
-        return state, self._waiting(state, newest[1]) if found is None else found
+        state, found = self._adopt(state, begun)
+        return state, self._with_reason(state, newest[1]) if found is None else found
 
-    def _attempt_beside(self, state: SolverState) -> tuple[SolverState, list[FrameEstimate]]:
+    def _attempt_in_background(self, state: SolverState) -> tuple[SolverState, list[FrameEstimate]]:
         """The state after an attempt, and the estimates of all pending frames; none if there is no map."""
         state, found = self._try_to_initialize(state)
         return state, [] if found is None else [*found.revised, found]
 
-    def _take_over(
+    def _adopt(
         self, state: SolverState, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
     ) -> tuple[SolverState, FrameEstimate | None]:
         """The state with what came of an initialization, as if no frame had come meanwhile."""
@@ -154,6 +156,6 @@ class MapInitialization(MapExtension):
         return found, replace(estimates[-1], revised=tuple(estimates[:-1]))
 
     @staticmethod
-    def _waiting(state: SolverState, estimate: FrameEstimate) -> FrameEstimate:
+    def _with_reason(state: SolverState, estimate: FrameEstimate) -> FrameEstimate:
         """The estimate of a pending frame, with the reason why it waits."""
         return replace(estimate, reason=state.waiting_reason or estimate.reason)
