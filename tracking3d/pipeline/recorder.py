@@ -202,9 +202,7 @@ class ObjectRecorder:
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: refine everything, or record why not though it was asked for."""
         self._unmet.warn()
-        for late in self._session.finish_background_work():
-            self._writer.record(late, "", revision=True)
-            self._writer.use_camera(self._session.camera)
+        self._write_late_estimates()
         self._state.save()
         estimates = self._open_refinement(source)
         if estimates is not None:
@@ -292,9 +290,8 @@ class ObjectRecorder:
             self.refinement.draw_rest()
             self._work.wait()
             surface, views = self.refinement.final_model()
-            config = (
-                self._session.config
-            )  # with `fine` and `extends` it is not sure that there will be a new shape
+            # With `fine` and `extends` the reconstruction may be refused, and this texture stays.
+            config = self._session.config
             replaced = config.object.shape == "auto" and config.object.extends is None
             replaced = replaced and is_reconstructed(self.refinement.records, config, source)
             largest = min(largest, _MAX_PROVISIONAL_SIZE) if replaced else largest
@@ -315,6 +312,8 @@ class ObjectRecorder:
         """Save the finished frames when ``error`` ends the run, and add this to ``error``."""
         self._work.end()
         with suppress(Exception):  # the first error is reported
+            self._write_late_estimates()
+        with suppress(Exception):
             self._state.save()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
@@ -327,6 +326,12 @@ class ObjectRecorder:
         model = self._causal_model or _model_so_far(self._session)
         with suppress(OutputError):  # the first error is reported
             self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
+
+    def _write_late_estimates(self) -> None:
+        """Write the estimates that a live session has computed in the background since its last frame."""
+        for late in self._session.finish_background_work():
+            self._writer.record(late, "", revision=True)
+            self._writer.use_camera(self._session.camera)
 
 
 def _model_so_far(session: Session) -> ObjectModel | None:

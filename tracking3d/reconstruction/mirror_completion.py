@@ -19,9 +19,9 @@ from tracking3d.reconstruction.seen_vertices import seen_vertices
 from tracking3d.reconstruction.shape_views import ShapeView
 
 _FACES, _SAMPLES = 4000, 4000
-_NEAR = 0.015  # of the diagonal: how far around the surface it is known what a view has seen
+_NEAR = 0.015  # uncertainty of the surface's depth, of the diagonal
 _MAX_SEEN = 0.9  # share of the surface from which there is nothing to complete
-_BESIDE = 2  # pixels around the silhouette that may be the object's or not
+_BAND = 2  # pixels around the silhouette that may belong to the object or to the background
 
 
 def complete_by_symmetry(
@@ -42,10 +42,10 @@ def complete_by_symmetry(
     if found is None:
         return inside, []
     mesh = decimate_roughly(main_pieces(found), _FACES)
-    known = _Known.of(mesh, views)
-    points, normals, share = _seen_samples(mesh, views)
+    points, normals, share = _sample_seen_surface(mesh, views)
     if share > _MAX_SEEN:
         return inside, []
+    known = _Known.of(mesh, views)
     planes = find_symmetry_planes(points, normals, known.is_free)
     for plane in planes:
         inside = _add_image(grid, inside, hull, plane, known)
@@ -58,9 +58,9 @@ class _Known:
 
     Attributes:
         views: The frames.
-        depths: ``(S, S)`` depth of the surface in each: infinite beside the object, where all that is seen is beyond
-            it, and minus infinite in a narrow band around its silhouette, which may be the one or the other.
-        near: Within which distance of the surface that is certain.
+        depths: ``(S, S)`` depth of the surface in each: infinite on the background, and minus infinite in a narrow band
+            around the silhouette, where pixels may belong to either.
+        near: Uncertainty of these depths.
     """
 
     views: Sequence[ShapeView]
@@ -72,18 +72,18 @@ class _Known:
         guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
         diagonal = float(np.linalg.norm(np.ptp(guide.vertices, axis=0)))
         depths = [guide.visible_to(view)[0] for view in views]
-        around = np.ones((2 * _BESIDE + 1,) * 2, np.uint8)
+        around = np.ones((2 * _BAND + 1,) * 2, np.uint8)
         for depth in depths:
             covered = np.isfinite(depth)
             depth[(cv2.dilate(covered.astype(np.uint8), around) > 0) & ~covered] = -np.inf
         return cls(views, depths, _NEAR * diagonal)
 
     def is_free(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """``(N,)`` whether a view sees past points ``(N, 3)``: before the surface, or beside the object."""
+        """``(N,)`` whether a view sees through points ``(N, 3)`` to the surface or to the background."""
         return self._is_before(points, -self.near)
 
     def is_seen(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """``(N,)`` whether points ``(N, 3)`` are free, or near to a surface that a view sees."""
+        """``(N,)`` whether points ``(N, 3)`` are free, or within the uncertainty of a surface that a view sees."""
         return self._is_before(points, self.near)
 
     def _is_before(self, points: NDArray[np.floating], behind: float) -> NDArray[np.bool_]:
@@ -99,7 +99,7 @@ class _Known:
         return before
 
 
-def _seen_samples(
+def _sample_seen_surface(
     mesh: trimesh.Trimesh, views: Sequence[ShapeView]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Points ``(N, 3)`` spread over what was seen of a surface, their normals, and what share of it that is."""

@@ -1,9 +1,9 @@
 """Planes of mirror symmetry of a surface of which a part was seen.
 
-Two points of a surface and their normals determine one plane in which they are images of each other. Of the planes of
-many random pairs, the one that maps most of the seen surface onto itself is refined and tested: what it maps elsewhere
-has to lie where no frame has looked, for a frame that looked there would have shown the object. A box of which three
-faces at a corner were seen has such planes between its other faces; a side of it alone has none that tell anything.
+Two points of a surface with their normals determine one plane in which they are mirror images. Of the planes of many
+random pairs, those that map most of the seen surface onto itself are refined and tested: the rest has to be mapped to
+where no frame has looked, for otherwise a frame would have shown the object there. If three faces of a box at a corner
+were seen, the planes half-way between opposite faces pass this test.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ class _Surface:
     def centre(self, asked: NDArray[np.int64], normal: FloatArray, offset: float) -> float:
         """The offset near an offset with which most of the surface is its own image.
 
-        A flat side slides along itself; only its ends tell where its middle is. Near them images count as on the
-        surface for a while, to both sides, so the middle of the best offsets is taken.
+        A flat side can slide along itself; only its ends determine where its middle is. Since images near the ends
+        match within a tolerance, several offsets are equally good, and their mean is taken.
         """
         offsets = offset + self.tolerance * np.linspace(-_SLIDE, _SLIDE, _OFFSETS)
         support = np.array([self.support(asked, normal, one) for one in offsets])

@@ -75,7 +75,7 @@ def _find_missing_details(
     view: TextureView,
     gain: FloatArray,
 ) -> tuple[TextureView, SeenTexels]:
-    """What a view shows of texels beside what the texture predicts."""
+    """The difference between what a view shows of its texels and what the texture predicts."""
     R = torch.from_numpy(view.T_cam_obj[:3, :3]).float()
     t, K = torch.from_numpy(view.T_cam_obj[:3, 3]).float(), torch.from_numpy(view.K).float()
     size = view.valid.shape[0], view.valid.shape[1]

@@ -3,7 +3,7 @@
 Every view says what it shows of every texel. The views' exposures are brought to one level, and each texel takes the
 mean of what they show, weighted so steeply by how frontally and how sharply a view shows it that one or two decide:
 a mean of many would blur by what poses and shape are off. A view whose colour is far from the others' has little say
-there: a highlight, a hand, something in front. Details that are lost all the same are given back in the end.
+there: a highlight, a hand, something in front. Fine details that are lost all the same are restored at the end.
 """
 
 from __future__ import annotations

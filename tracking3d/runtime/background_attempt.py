@@ -20,10 +20,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _MAX_LEFT = 2  # items that are left to the caller's thread in the end
-_STRIDE, _MAX_BATCH = (
-    3,
-    10,
-)  # every so-manyth of the queued items is processed, and no more than this at a time
+_STRIDE = 3  # every third of the queued items is processed
+_MAX_BATCH = 10  # items that are processed at a time
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,19 +53,19 @@ def with_next(items: Iterable[T]) -> Generator[tuple[T, T | None]]:
 
 
 def start_in_thread(job: Callable[[], T], threads: int) -> Callable[[], T]:
-    """Begin a job in another thread, if there may be more than one; gives what waits for its result.
+    """Begin a job in another thread, if more than one may be used.
 
     Args:
         job: Does not depend on what the caller does meanwhile.
         threads: How many threads there may be; with one the job is done at once.
 
     Returns:
-        Gives the result, or raises what the job ended with.
+        A function that waits for the result and returns it, or raises the job's error.
     """
     if threads <= 1:
         result = job()
         return lambda: result
-    thread = ThreadPoolExecutor(1, "tracking3d-beside")
+    thread = ThreadPoolExecutor(1, "tracking3d-job")
     running = thread.submit(job)
     thread.shutdown(wait=False)
     return running.result
