@@ -234,11 +234,6 @@ def test_no_module_is_longer_than_a_reader_keeps_in_mind():
     assert not [path for path, lines in lengths().items() if lines > LONGEST_MODULE]
 
 
-def test_half_of_the_modules_are_short():
-    found = sorted(lengths().values())
-    assert found[len(found) // 2] <= 150
-
-
 def test_functions_are_short_and_take_few_parameters():
     """A command of the CLI may take more parameters, and so may `track`, its twin in Python: each is an option."""
     checked, faults, free = 0, [], {*commands(), "tracking3d.pipeline.track.track"}

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tracking3d.config.models import ObjectConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.mesh import Mesh
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.geometry.prototypes import ellipsoid, from_file, sphere
 
 RADIUS = 0.9
@@ -72,6 +74,23 @@ def first_translation(ellipse: MaskEllipse, camera: Camera) -> NDArray[np.float6
     x = (ellipse.centre[0] - camera.cx) / camera.fx
     y = (ellipse.centre[1] - camera.cy) / camera.fy
     return np.array([x * depth, y * depth, depth])
+
+
+def place_on_mask(rest: Tensor, camera: Camera, mask: NDArray[np.bool_]) -> Pose:
+    """The pose of the prototype on a later mask: as near as that is large, and turned in the image as it lies.
+
+    Args:
+        rest: ``(V, 3)`` the prototype, as `prototype_mesh` makes it from the first mask.
+        camera: The camera of the full frame.
+        mask: ``(H, W)``, not empty.
+    """
+    ellipse = mask_ellipse(mask)
+    _, directions = np.linalg.eigh(np.cov(rest[:, :2].double().cpu().numpy().T))
+    (x0, y0), (x1, y1) = directions[:, 1], ellipse.directions[:, 0]
+    turn = math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1))
+    turn = (turn + 90) % 180 - 90  # an ellipse looks the same after half a turn
+    translation = rest.new_tensor(first_translation(ellipse, camera))
+    return from_matrix(rotation_about(rest.new_tensor([0.0, 0.0, 1.0]), turn), translation)
 
 
 def prototype_mesh(config: ObjectConfig, ellipse: MaskEllipse) -> Mesh:

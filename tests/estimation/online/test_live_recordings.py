@@ -100,7 +100,7 @@ def test_a_map_that_comes_after_the_last_frame_gives_all_pending_frames_their_po
 
 
 def test_an_iterator_waits_and_gives_the_same_estimates_as_a_list():
-    given = dict(mask=true_mask(0), config=config())
+    given = {"mask": true_mask(0), "config": config()}
     from_list, from_iterator = list(track(images(), **given)), list(track(iter(images()), **given))
     assert any(estimate.revised for estimate in from_list)
     for a, b in zip(from_list, from_iterator, strict=True):

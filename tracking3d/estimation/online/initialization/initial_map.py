@@ -22,7 +22,7 @@ from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.prototype_start import RADIUS
+from tracking3d.estimation.prototype_start import RADIUS, place_on_mask
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 
@@ -140,6 +140,8 @@ def initialize_without_points(
     """
     near = [view for view in views if view.index - views[0].index <= _ROTATION_FRAMES]
     chosen = _spread_views(near if len(near) >= _MIN_ROTATION_VIEWS else views, _ROTATION_VIEWS)
+    if (mask := chosen[0].mask) is not None and mask.any():  # the object may have moved since the first frame
+        chosen[0] = replace(chosen[0], pose=place_on_mask(object_map.shape.rest, camera, mask))
     modes = ShapeBasis.of(object_map.shape)
     tried = [
         (math.inf, name, replace(object_map, keyframes=_with_poses(chosen, poses)))

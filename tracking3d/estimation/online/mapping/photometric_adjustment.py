@@ -21,7 +21,7 @@ from tracking3d.estimation.online.optimization.shading import (
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis, project_on_basis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.shape import flatten
+from tracking3d.estimation.shape import flatten, unfold
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import Contour, Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
@@ -205,6 +205,7 @@ def _step(
         [problem.shape_unknowns, 6 * len(problem.K), len(step) - problem.shape_unknowns - 6 * len(problem.K)]
     )
     vertices = state.vertices + (problem.modes.vectors @ shape.reshape(-1, 3)).to(state.vertices)
+    vertices = unfold(problem.object_map.shape, vertices)
     moved = [_update_pose(state.poses[n], part) for n, part in enumerate(poses.reshape(-1, 6).to(vertices))]
     return _evaluate(problem, vertices, Pose.stack(moved))
 
