@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pixel_distance import pixel_distance
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import PoseTarget, channels_last, signed_distance
+
+_HULL_SHARE = 0.4  # of the distance to the mask's convex hull behind an occluder (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +58,21 @@ class Observation:
 
     @cached_property
     def outline_distance(self) -> Tensor:
-        """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`."""
-        return outline_distance(self.mask, self.valid)
+        """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`.
+
+        Behind an occluder the outline is that of the mask's convex hull, at a lower weight: a surface that were free
+        there would grow sheets, and the occluder's outline is not the object's.
+        """
+        if self.occluder is None or not self.has_mask:
+            return outline_distance(self.mask, self.valid)
+        covered = self.occluder > 0.5
+        hull = torch.from_numpy(convex_hull((self.mask > 0.5).cpu().numpy())).to(covered.device)
+        distance = outline_distance(torch.where(hull & covered, 1.0, self.mask), self.valid)
+        return torch.where(covered, _HULL_SHARE * distance, distance)
 
     @cached_property
     def free_outline_distance(self) -> Tensor:
-        """The same, of the outline that is no occluder's: poses are fitted to it.
-
-        Surfaces are not. What something hides in all frames would be free to have any shape.
-        """
+        """The same, of nothing but the outline that is no occluder's: poses are fitted to it."""
         if self.occluder is None:
             return self.outline_distance
         return outline_distance(self.mask, self.valid * (self.occluder < 0.5))
@@ -76,7 +85,7 @@ class Observation:
             self.K,
             channels_last(self.features[None])[0],
             self.valid * self.mask if self.has_mask else self.valid,
-            self.valid > 0.5,
+            self.valid > 0.5 if self.occluder is None else (self.valid > 0.5) & (self.occluder < 0.5),
             self.mask > 0.5 if self.has_mask else None,
             self.free_outline_distance if self.has_mask else None,
         )
@@ -236,6 +245,15 @@ def mask_box(mask: NDArray[np.bool_]) -> Box:
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     left, top = float(columns[0]), float(rows[0])
     return left, top, float(columns[-1] + 1) - left, float(rows[-1] + 1) - top
+
+
+def convex_hull(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(S, S)`` the convex hull of a mask's pixels; empty if the mask is."""
+    hull = np.zeros(mask.shape, np.uint8)
+    if mask.any():
+        points = np.argwhere(mask)[:, ::-1].astype(np.int32)
+        cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
+    return hull > 0
 
 
 def outline_distance(mask: Tensor, valid: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ def test_a_frame_that_is_filled_or_empty_has_no_outline():
         assert float(filled.outline_distance.abs().max()) == 0
 
 
-def test_beside_an_occluder_poses_see_no_outline_but_surfaces_do():
+def test_behind_an_occluder_poses_see_no_outline_and_surfaces_the_hull_at_a_lower_weight():
     inside = replace(bar(cut=False), valid=torch.ones(64, 64))
     hand = torch.zeros(64, 64)
     hand[:, 30:45] = 1  # where the bar ends
@@ -63,7 +63,10 @@ def test_beside_an_occluder_poses_see_no_outline_but_surfaces_do():
     )  # the bar goes on to the middle of the hand, beyond which background is nearer
     assert float(free[:, 30:45].abs().max()) == 0
     assert float(free[30, 10]) == -0.5
-    torch.testing.assert_close(hidden.outline_distance, inside.outline_distance)
+    surface, covered = hidden.outline_distance, hand > 0
+    torch.testing.assert_close(surface[~covered], inside.outline_distance[~covered])
+    torch.testing.assert_close(surface[covered], 0.4 * inside.outline_distance[covered])  # a bar is convex
+    assert not bool(hidden.target.inside[covered].any())
     torch.testing.assert_close(inside.free_outline_distance, inside.outline_distance)
 
 
