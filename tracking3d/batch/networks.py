@@ -6,9 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from tracking3d.batch.video_job import VideoJob
+from tracking3d.config.models import AUTO
 from tracking3d.engines.protocol import Engine, Shared
 from tracking3d.networks.catalogue import known_networks
 from tracking3d.networks.store import find_known, network_path
+from tracking3d.pipeline.tracker_selection import CANDIDATES
 from tracking3d.results.files import write_atomic, writing
 
 
@@ -28,9 +30,10 @@ class SharedNetwork:
 def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetwork, ...]:
     """Share the networks that the jobs name through the engine, if its workers may be on other machines.
 
+    The mask tracker ``auto`` names all that it may choose from, so that it chooses there as it would here.
     Networks that are given by the path of a file are not sent: every machine must have them there.
     """
-    known = known_networks()
+    known, jobs = known_networks(), list(jobs)
     named = {
         value
         for job in jobs
@@ -38,6 +41,8 @@ def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetw
         for value in plugin.model_dump().values()
         if isinstance(value, str) and value in known
     }
+    if any(job.config.tracker.name == AUTO for job in jobs):
+        named |= {network for candidate in CANDIDATES for network in candidate.networks}
     shared = []
     for name in sorted(named):
         path = network_path(known[name])

@@ -75,7 +75,7 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
         "seconds": about["timings"]["seconds_total"] + refinement,
         "seconds_per_frame": per_frame,
         "peak_memory_mb": about.get("peak_memory_mb"),
-        "tracker": job.config.tracker.name,
+        "tracker": run.config["tracker"]["name"],
         "attempts": attempts,
         "machine": platform.node(),
         "finished": now(),

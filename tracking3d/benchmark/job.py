@@ -24,15 +24,17 @@ from tracking3d.benchmark.fingerprint import (
 from tracking3d.benchmark.initial_masks import masks_for
 from tracking3d.benchmark.noisy_frames import NoisyFrames
 from tracking3d.benchmark.variant import Variant
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.evaluation.score import score
+from tracking3d.pipeline.tracker_selection import choose_tracker
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.runtime.memory import resident_memory
+from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
 
@@ -74,8 +76,11 @@ class Job:
 
     @cached_property
     def config(self) -> PipelineConfig:
-        """The pipeline, with the camera that the dataset gives to a tracker unless the configuration has one."""
+        """The pipeline with its mask tracker, and the camera that the dataset gives to one unless there is one."""
         config = self.variant.config
+        if self.variant.masks == "tracker" and config.tracker.name == AUTO:
+            size = read_image(self.truth.frames[0]).shape[:2]
+            config, _ = choose_tracker(config, len(self.truth.frames), False, size)
         camera = self.truth.given_camera or self.truth.camera
         if (
             camera is None
@@ -132,7 +137,7 @@ class Job:
             "layout": self.layout,
             "root": str(self.root),
             "sequence": self.sequence,
-            "variant": self.variant.model_dump(mode="json"),
+            "variant": self.variant.model_copy(update={"config": self.config}).model_dump(mode="json"),
             "out": str(self.out),
         }
         write_atomic(self.folder / JOB, json.dumps(document, indent=1).encode())

@@ -27,7 +27,7 @@ def show(
     import yaml
 
     from tracking3d.config.loading import layers_in_words
-    from tracking3d.pipeline.tracker_selection import AUTO
+    from tracking3d.config.models import AUTO
     from tracking3d.plugins import FEATURES, TRACKERS, check_options
 
     settings = configure(config, preset, overrides, quality)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,10 @@ from tracking3d.cli.options import Debug, Quiet, Run, Video
 from tracking3d.cli.options.choices import model_option
 from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.errors import InputError
+
+if TYPE_CHECKING:
+    from tracking3d.config.models import PipelineConfig
+    from tracking3d.results.run_reader import RunReader
 
 Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
 
@@ -29,7 +33,7 @@ def _refuse_quality(value: str | None) -> None:
 
 def model(
     run: Run,
-    model: Annotated[str, model_option()] = "fast",
+    model: Annotated[str, model_option()] = "auto",
     quality: Annotated[str | None, typer.Option(hidden=True, callback=_refuse_quality)] = None,
     extend: Annotated[
         Path | None,
@@ -39,14 +43,24 @@ def model(
     ] = None,
     object_size: ObjectSize = None,
     source: Video = None,
-    views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
-    largest: Largest = 2048,
+    views: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=500, show_default="as in the run", help="Frames that the texture is taken from."
+        ),
+    ] = None,
+    largest: Annotated[
+        int | None,
+        typer.Option(
+            min=64, max=8192, show_default="as in the run", help="Maximum side of the texture, in texels."
+        ),
+    ] = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Re-texture the mesh of a run from its video, and with --model fine reconstruct its shape too.
+    """Make the final mesh of a run again, from its video: by default the one that `tracking3d run` makes.
 
-    `tracking3d run` does this at its end, with the same option --model. With --extend the frames of an earlier run of
+    --model means the same as there. With --extend the frames of an earlier run of
     the same object make shape and texture, too. The run's contact sheet, report and turntable
     are made again, if it has them.
     """
@@ -56,13 +70,22 @@ def model(
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
+    from tracking3d.reconstruction.final_shape import texture_limits
     from tracking3d.report.renewal import renew_report
+    from tracking3d.results.run_reader import RunReader
 
+    config = _settings_of_run(RunReader(run))
+    if extend is None and model == "auto" and config.object.extends is not None:
+        extend = Path(config.object.extends)
+    most, texels = texture_limits(config)
+    limits = most if views is None else views, texels if largest is None else largest
     if extend is None:
-        outcome = _make_mesh(run, model, source, views, largest, quiet)
+        if model == "auto":
+            model = _default_model(RunReader(run), config, keeps=views is None and largest is None)
+        outcome = _make_mesh(run, model, source, *limits, quiet)
     else:
         check_run_folder(extend)
-        outcome = _extend_mesh(run, extend, source, views, largest, quiet)
+        outcome = _extend_mesh(run, extend, source, *limits, quiet)
     if object_size is not None:
         from tracking3d.results.run_unit import scale_run
 
@@ -74,16 +97,43 @@ def model(
         typer.echo("\n".join(outcome))
 
 
+def _settings_of_run(run: RunReader) -> PipelineConfig:
+    """The settings of a run, but with the final mesh that is made by default; those of an old version do not count."""
+    from pydantic import ValidationError
+
+    from tracking3d.config.choices import set_model
+    from tracking3d.config.models import PipelineConfig
+
+    try:
+        return set_model(PipelineConfig.model_validate(run.config), "auto")
+    except ValidationError:
+        return PipelineConfig()
+
+
+def _default_model(run: RunReader, config: PipelineConfig, keeps: bool) -> str:
+    """What --model auto comes to.
+
+    Args:
+        run: The run.
+        config: See `_settings_of_run`.
+        keeps: Whether the texture from the final refinement, if there is one, is what was asked for.
+    """
+    from tracking3d.reconstruction.final_shape import is_reconstructed
+
+    if config.object.model is not None:
+        return "none"
+    if is_reconstructed(run.frames, config):
+        return "fine"
+    refined = (run.description.get("refinement") or {}).get("frames")
+    textured = run.config.get("object", {}).get("texture_views")
+    return "none" if keeps and refined and textured else "fast"
+
+
 def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: int, quiet: bool) -> list[str]:
     """Make the mesh of a run, and return what to print about it."""
     from tracking3d.cli.plans import plan_shape, plan_texture
     from tracking3d.cli.progress import show_progress
-    from tracking3d.reconstruction.rebuild import (
-        has_packages,
-        rebuild_shape,
-        restore_online_mesh,
-        retexture_run,
-    )
+    from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
     from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader
 
@@ -93,7 +143,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
             f"{run}: {'the online mesh again' if restored else 'has the online mesh already; it stays as it is'}"
         ]
     frames, outcome = len(RunReader(run).frames), []
-    if model == "fine" or (model == "auto" and has_packages()):
+    if model == "fine":
         with show_progress(quiet, plan_shape(frames)):
             shaped = rebuild_shape(run, source, views, largest)
         note_in_run(run, {"shape": shaped.sentence})

@@ -146,15 +146,16 @@ def settings_menu(
 
 def _with_named_tracker(config: PipelineConfig, source: str, frames: str | None) -> PipelineConfig:
     """The configuration with a tracker in place of ``auto``, since the page shows its masks."""
+    from tracking3d.config.models import AUTO
     from tracking3d.frames import Frame
     from tracking3d.pipeline.tracker_selection import choose_tracker
     from tracking3d.video import open_source
 
-    if config.tracker.name != "auto":
+    if config.tracker.name != AUTO:
         return config
     opened = open_source(source, frames)
     first = next((frame for frame in opened if isinstance(frame, Frame)), None)
-    return config if first is None else choose_tracker(config, opened.count, False, first, None)[0]
+    return config if first is None else choose_tracker(config, opened.count, False, first.size)[0]
 
 
 def prompts_of(picked: Picked) -> PromptSet:

@@ -75,8 +75,9 @@ def advise_networks(tracker: str) -> str:
         return ""
     size = sum(network.size or 0 for network in networks) / 1e6
     return (
-        f"`tracking3d models get recommended` ({size:.0f} MB), then --tracker auto; mean IoU of the initial masks "
-        "with the true ones on four real clips: .93; with segment, which needs none, .90, with csrt .86"
+        f"`tracking3d models get recommended` ({size:.0f} MB), which the default, --tracker auto, then takes; mean IoU "
+        "of the initial masks with the true ones on four real clips: .93; with segment, which needs none, .90, with "
+        "csrt .86"
     )
 
 

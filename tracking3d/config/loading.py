@@ -70,8 +70,8 @@ def load_config(
     chosen = [(origin, _chosen_names(layer)) for origin, layer in spoken]
 
     for origin, layer in [*layers, *chosen, *spoken]:
-        config = _validate(_merge(settings, _without_shorthand(layer), _CHOICES), origin)
-        settings = config.model_dump()
+        settings = _merge(settings, _without_shorthand(layer), _CHOICES)
+        config = _validate(settings, origin)
     return config
 
 

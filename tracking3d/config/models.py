@@ -13,6 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tracking3d.config.section import Section
 from tracking3d.config.solvers import OnlineConfig, SolverConfig
 
+AUTO = "auto"
+"""Name of the mask tracker that stands for the best one at hand, see `tracking3d.pipeline.tracker_selection`."""
+
 
 class PluginChoice(BaseModel):
     """A plug-in by name; every other key is an option of the plug-in, which its own ``Options`` checks."""
@@ -258,13 +261,20 @@ class RuntimeConfig(Section):
 class PipelineConfig(Section):
     """The whole pipeline."""
 
-    tracker: PluginChoice = PluginChoice(name="csrt")
+    tracker: PluginChoice = PluginChoice(name=AUTO)
     features: PluginChoice = PluginChoice(name="rgb")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
     crop: CropConfig = CropConfig()
     solver: SolverConfig = OnlineConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+
+    @field_validator("tracker")
+    @classmethod
+    def _options_have_an_owner(cls, tracker: PluginChoice) -> PluginChoice:
+        """Options without the name of a tracker are those of `segment`, whose network is always there."""
+        alone = tracker.name != AUTO or not tracker.options
+        return tracker if alone else PluginChoice(name="segment", **tracker.options)
 
     @property
     def has_given_masks(self) -> bool:

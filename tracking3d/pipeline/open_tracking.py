@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, Prompt, SkippedFrame
 from tracking3d.pipeline.components import build_encoder, check_backward_tracking
 from tracking3d.pipeline.frame_reading import read_from
 from tracking3d.pipeline.session import Session
-from tracking3d.pipeline.tracker_selection import AUTO, choose_tracker
+from tracking3d.pipeline.tracker_selection import choose_tracker
 from tracking3d.pipeline.validation import (
     check_single_known_object,
     check_source,
@@ -157,7 +157,7 @@ def open_tracking(request: TrackRequest, earlier: Path | None = None) -> Iterato
     try:
         skipped, first = _read_first(frames, source.name, request.skip_damaged)
         made = prompts.make(first, request.config.tracker.name)
-        config, choice = _select_tracker(request, first, made[0], earlier)
+        config, choice = _select_tracker(request, first, earlier)
         encoder = build_encoder(config) if len(made) > 1 else None
         lens, live = (source.intrinsics, source.intrinsics_origin), is_live(source)
         objects = tuple(
@@ -188,17 +188,16 @@ def _read_first(
 
 
 def _select_tracker(
-    request: TrackRequest, first: Frame, prompt: Prompt | None, earlier: Path | None
+    request: TrackRequest, first: Frame, earlier: Path | None
 ) -> tuple[PipelineConfig, str | None]:
     """The configuration with a tracker in place of ``auto``, and why it is that one; None if the user named it."""
     config, source = request.config, request.source
-    if config.tracker.name != AUTO:
-        return config, None
-    if earlier is not None and (earlier / RUN).is_file():
+    if config.tracker.name == AUTO and earlier is not None and (earlier / RUN).is_file():
         before = RunReader(earlier)
         if why := before.description.get("tracker_choice"):
             tracker = PluginChoice.model_validate(before.config["tracker"])
             return config.model_copy(update={"tracker": tracker}), str(why)
-    config, why = choose_tracker(config, source.count, not source.repeatable, first, prompt)
-    _log.info("Mask tracker: %s.", why)
-    return config, why
+    config, chosen = choose_tracker(config, source.count, not source.repeatable, first.size)
+    if chosen is not None:
+        _log.info("Mask tracker: %s.", chosen)
+    return config, chosen

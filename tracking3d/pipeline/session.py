@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.camera import warn_of_unlikely
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
 from tracking3d.estimation.solver import GuidedSolver, LiveSolver, Solver
@@ -33,6 +33,7 @@ from tracking3d.pipeline.frame_order import FrameOrder
 from tracking3d.pipeline.known_object import load_known_object, select_camera
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.session_refinement import SessionRefinement
+from tracking3d.pipeline.tracker_selection import choose_tracker
 from tracking3d.pipeline.validation import check_frame, check_session
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.prompts.prompt import check_prompt_fits
@@ -46,7 +47,7 @@ class Session(SessionRefinement):
     The process's threads and random numbers are the session's only while it works; in between they are the caller's.
 
     Args:
-        config: The pipeline.
+        config: The pipeline; the size of the first frame decides on the mask tracker ``auto``.
         prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds the known object.
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
@@ -55,7 +56,7 @@ class Session(SessionRefinement):
             the result depends on how fast the machine is.
 
     Attributes:
-        config: The pipeline.
+        config: The pipeline; from the first frame on, its mask tracker is never ``auto``.
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: The solver's input for the latest frame: the mask tracker's estimate, or its replacement.
         corrected: Whether the latest estimate was fed back to the mask tracker.
@@ -86,7 +87,8 @@ class Session(SessionRefinement):
         self._settings = IsolatedRuntime(self.renderer, runtime.device, runtime.seed)
         self._replaying = IsolatedRuntime(self.renderer, runtime.device, runtime.seed)
         with self._settings.in_force():
-            self._tracker = PromptedTracker(config.tracker, prompt)
+            if config.tracker.name != AUTO:
+                self._tracker = PromptedTracker(config.tracker, prompt)
             self._encoder = build_encoder(config) if encoder is None else encoder
         self._solver: Solver[Any] | None = None
         self._state: Any = None
@@ -138,7 +140,7 @@ class Session(SessionRefinement):
         return add_times(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
-        solver = self._build_solver(frame)
+        solver = self._prepare(frame)
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
@@ -152,9 +154,12 @@ class Session(SessionRefinement):
             self._feed_back(frame, estimate)
         return estimate
 
-    def _build_solver(self, first: Frame) -> Solver[Any]:
-        """The solver for a video that begins with ``first``; the camera is set for it, too."""
+    def _prepare(self, first: Frame) -> Solver[Any]:
+        """The solver for a video that begins with ``first``; camera and mask tracker are set for it, too."""
         height, width = first.size
+        if self.config.tracker.name == AUTO:
+            self.config, _ = choose_tracker(self.config, None, self._live, first.size)
+            self._tracker = PromptedTracker(self.config.tracker, self._prompt)
         self._camera = select_camera(self.config, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, FrameOrder(first.index), first.index
@@ -217,7 +222,8 @@ class Session(SessionRefinement):
         Raises:
             PluginError: If the mask tracker cannot be restored.
         """
-        self._solver = self._build_solver(first)
+        with self._settings.in_force():
+            self._solver = self._prepare(first)
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)

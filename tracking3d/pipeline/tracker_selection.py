@@ -1,27 +1,29 @@
-"""The mask tracker ``auto``: the best of those that can be used here and that this machine and video can afford."""
+"""The mask tracker ``auto``: the best of those at hand whose cost, as it was measured once, the video can afford.
+
+Nothing is timed where it runs: the same video and the same networks give the same tracker, whatever the load.
+"""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from tracking3d.config.models import PipelineConfig, PluginChoice
-from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.frames import Frame, Prompt
+from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
 from tracking3d.networks.catalogue import known_networks
 from tracking3d.networks.store import State, state_of
-from tracking3d.plugins import TRACKERS, build_plugin, check_options
+from tracking3d.plugins import TRACKERS, check_options
 
-AUTO = "auto"
-"""Name of the tracker that stands for the best one."""
 AFFORDABLE = 900.0
-"""Seconds that the masks of a whole video may take."""
+"""Seconds that the masks of a whole video may take (chosen)."""
 UNHURRIED, LIVE = 1.0, 0.1
-"""Seconds that one frame's mask may take if the number of frames is unknown, or of a camera."""
-_CARRIED = 0.05
-"""Seconds in which a mask is carried on to a frame that the network is not asked about."""
+"""Seconds that one frame's mask may take if the number of frames is unknown, or of a camera (chosen)."""
+SECONDS_PER_MEGAPIXEL = 0.05
+"""Growth of any tracker's cost with the picture: .059 with csrt, .048 with segment, .037 with flow (measured).
+
+Networks see a crop of a fixed size, so that only their box tracker and colours cost more.
+"""
+_USUAL = 0.3072  # megapixels, 640 x 480
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class TrackerCandidate:
         name: Name of the plug-in.
         what: What sentences call it.
         iou: Mean IoU with true masks over the four real clips, see docs/masks.md and docs/segmenters.md.
-        seconds: A frame on one core of the machine on which that was measured.
+        seconds: Processor time of a frame of 640 x 480 pixels, from the same pages.
         networks: Known networks that it needs.
         options: Its options.
     """
@@ -43,6 +45,10 @@ class TrackerCandidate:
     seconds: float
     networks: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
+
+    def cost(self, size: tuple[int, int]) -> float:
+        """Seconds of a frame of ``(height, width)`` pixels."""
+        return self.seconds + SECONDS_PER_MEGAPIXEL * max(size[0] * size[1] / 1e6 - _USUAL, 0.0)
 
 
 _SAM = {"segmenter": "mobile-sam", "encoder": "mobile-sam-encoder", "decoder": "mobile-sam-decoder"}
@@ -77,7 +83,7 @@ CANDIDATES = (
     # Estimates to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24
     # fresh clips, and of .891 and .874 on five real ones; flow takes half of the time.
     TrackerCandidate("csrt", "csrt, which needs no network", 0.857, 0.06),
-    TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
+    TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.03),
 )  # fmt: skip
 """The best first."""
 
@@ -86,52 +92,42 @@ def check_tracker_options(config: PipelineConfig) -> None:
     """Make sure of the options of the mask tracker; ``auto`` has none.
 
     Raises:
-        PluginError: If the tracker is unknown or broken.
-        InputError: If an option is wrong.
+        PluginError: If the tracker is unknown or broken, or an option is wrong.
     """
     if config.tracker.name != AUTO:
         check_options(TRACKERS, config.tracker)
-    elif config.tracker.options:
-        raise InputError(
-            f"tracker.{next(iter(config.tracker.options))} is an option of one tracker, and '{AUTO}' stands for "
-            "whichever is best; name the tracker."
-        )
 
 
 def choose_tracker(
-    config: PipelineConfig, frames: int | None, live: bool, first: Frame, prompt: Prompt | None
-) -> tuple[PipelineConfig, str]:
+    config: PipelineConfig, frames: int | None, live: bool, size: tuple[int, int]
+) -> tuple[PipelineConfig, str | None]:
     """The configuration with a tracker in place of ``auto``, and why it is that one; nothing is fetched.
 
     Args:
-        config: The pipeline; with another tracker than ``auto`` it is given back with an empty text.
+        config: The pipeline; with another tracker than ``auto`` it is given back, and no reason.
         frames: Number of frames, if it is known.
         live: Whether they do not wait.
-        first: The first frame, on which trackers with networks are timed.
-        prompt: The object in it; None if it is not prompted.
+        size: Height and width of the frames in pixels.
     """
     if config.tracker.name != AUTO:
-        return config, ""
-    height, width = first.size
-    prompt = prompt or Prompt((0.0, 0.0, float(width), float(height)))
+        return config, None
     budget = LIVE if live else UNHURRIED if not frames else AFFORDABLE / frames
-    passed: list[str] = []
-    for candidate in _is_usable():
-        seconds = _time_per_frame(candidate, first, prompt) if candidate.networks else candidate.seconds
-        if seconds is not None and (seconds <= budget or not candidate.networks):
+    passed = ""
+    for candidate in _usable_candidates():
+        cost = candidate.cost(size)
+        if cost <= budget or not candidate.networks:
             choice = PluginChoice(name=candidate.name, **candidate.options)
-            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} on the measured clips, {seconds:.2f} s a frame"
-            why += " here" if candidate.networks else ""
+            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} on the measured clips, about {cost:.2f} s a frame"
             if passed:
-                why += f"; within {budget:.2g} s a frame, which rules out {passed[0]}"
+                why += f"; within {budget:.2g} s a frame, which rules out {passed}"
             elif not candidate.networks:
                 why += "; no network of a better one is in your cache (`tracking3d models list`)"
             return config.model_copy(update={"tracker": choice}), f"{choice.name} ({why})"
-        passed.append(candidate.what)
+        passed = passed or candidate.what
     raise AssertionError("the last candidate needs nothing and is always taken")
 
 
-def _is_usable() -> Iterator[TrackerCandidate]:
+def _usable_candidates() -> Iterator[TrackerCandidate]:
     """The candidates whose networks are in the cache, whole; ``segment`` and ``csrt`` if this OpenCV allows them."""
     from tracking3d.trackers.csrt import CsrtTracker
     from tracking3d.trackers.segment.tracker import SegmentTracker
@@ -148,26 +144,3 @@ def _is_usable() -> Iterator[TrackerCandidate]:
                 whole[name] = state_of(known[name]) in (State.OK, State.UNCHECKED)
         if all(whole[name] for name in candidate.networks):
             yield candidate
-
-
-def _time_per_frame(candidate: TrackerCandidate, first: Frame, prompt: Prompt) -> float | None:
-    """Seconds that a frame takes here; None if the tracker cannot be used.
-
-    The same frame is shown twice. If a network sees every k-th frame only, the time is divided by k.
-    """
-    every = candidate.options.get("every", 1)
-    choice = PluginChoice(name=candidate.name, **{**candidate.options, "every": 1})
-    try:
-        import torch
-
-        from tracking3d.runtime.isolation import preserve_process
-
-        with preserve_process(torch.device("cpu")):
-            tracker = build_plugin(TRACKERS, choice)
-            tracker.init(first, prompt)
-            started = time.perf_counter()
-            tracker.step(first)
-            spent = time.perf_counter() - started
-    except (Tracking3dError, RuntimeError, ValueError):
-        return None
-    return spent / every + (_CARRIED if every > 1 else 0.0)

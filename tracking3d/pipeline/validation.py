@@ -11,7 +11,6 @@ from tracking3d.config.loading import load_config
 from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, Prompt
-from tracking3d.pipeline.tracker_selection import AUTO
 from tracking3d.prompts.prompt import validate_box, validate_mask
 from tracking3d.video.source import FrameSource
 
@@ -52,11 +51,6 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
     """
     if not isinstance(config, PipelineConfig):
         raise InputError(f"config= is {a_kind(config)}; give a PipelineConfig, see load_config.")
-    if config.tracker.name == AUTO:
-        raise InputError(
-            f"The tracker '{AUTO}' is chosen from the first frame, by track and record; for a session give the name of "
-            "a tracker, or the result of tracking3d.pipeline.tracker_selection.choose_tracker."
-        )
     if prompt is None and needs_prompt(config):
         raise InputError("Give the object with either a box or a mask in the first frame.")
     if prompt is not None:

@@ -80,7 +80,8 @@ def configure(
     """
     from tracking3d.config.choices import check_model, set_model
     from tracking3d.config.loading import load_config
-    from tracking3d.pipeline.tracker_selection import AUTO, check_tracker_options
+    from tracking3d.config.models import AUTO
+    from tracking3d.pipeline.tracker_selection import check_tracker_options
     from tracking3d.plugins import FEATURES, TRACKERS, check_options, plugin_label
 
     config = load_config(file, preset, overrides or (), quality=quality, **_without_none(direct))

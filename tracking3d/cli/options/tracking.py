@@ -15,7 +15,8 @@ Tracker = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Mask tracker; `tracking3d plugins` lists them. auto takes the best one installed.",
+        help="Mask tracker; `tracking3d plugins` lists them. auto takes the best one at hand.",
+        show_default="auto",
         rich_help_panel=TRACKING,
     ),
 ]
