@@ -1,4 +1,4 @@
-"""``tracking3d model`` makes the model of a finished run again as ``tracking3d run`` made it."""
+"""``tracking3d model`` makes the model of a finished run as ``tracking3d run`` made it at its end."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ import pytest
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
-from tracking3d.results.run_reader import RunReader
+from tracking3d.results.files import write_image
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
-FRAMES = 16
 MESH = ("mesh.obj", "mesh.glb", "texture.png", "features.npz")
 
 
-def made(*words: str | Path) -> None:
+def called(*words: str | Path) -> None:
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == 0, result.output
 
 
-def files_of(run: Path) -> dict[str, bytes]:
+def mesh_of(run: Path) -> dict[str, bytes]:
     return {name: (run / name).read_bytes() for name in MESH}
 
 
-@pytest.fixture(scope="module")
-def tracked(images, clip, tmp_path_factory) -> Path:
-    """A run of the clip by default, and one of fewer frames, in which the object turns too little for a new shape."""
-    folder = tmp_path_factory.mktemp("runs")
-    box = ",".join(map(str, clip.box))
-    for name, frames in (("turned", ":"), ("hardly_turned", ":4")):
-        made(
-            "run", images, "--box", box, "--frames", frames, "--no-report", "--quiet", "--out", folder / name
-        )
-    return folder
-
-
-@pytest.mark.parametrize(("name", "again"), [("turned", True), ("hardly_turned", False)])
-def test_a_finished_run_gets_the_same_mesh_again(tracked, name, again):
-    run = tracked / name
-    assert ("shape" in RunReader(run).description) is again
-    before = files_of(run)
-    made("model", run, "--quiet")
-    assert files_of(run) == before
+@pytest.mark.parametrize(
+    ("frames", "size", "step", "is_new"),
+    [
+        pytest.param(14, (160, 120), 4, True, id="the shape is new"),
+        pytest.param(12, (120, 96), 5, False, id="there are too few frames for a new one"),
+        pytest.param(5, (120, 96), 2, False, id="the object hardly turns"),
+    ],
+)
+def test_a_finished_run_gets_the_same_mesh_again(tmp_path, frames, size, step, is_new):
+    clip = synthesize(SyntheticSpec(frames=frames, size=size, supersample=1, degrees_per_frame=step))
+    for index, image in enumerate(clip.images):
+        (tmp_path / "frames").mkdir(exist_ok=True)
+        write_image(tmp_path / "frames" / f"{index:03d}.png", image)
+    run, box = tmp_path / "run", ",".join(map(str, clip.box))
+    called("run", tmp_path / "frames", "--box", box, "--no-report", "--quiet", "--out", run)
+    before = mesh_of(run)
+    assert (run / "online").is_dir() is is_new
+    called("model", run, "--quiet")
+    assert mesh_of(run) == before

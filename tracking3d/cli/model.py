@@ -111,18 +111,20 @@ def _settings_of_run(run: RunReader) -> PipelineConfig:
 
 
 def _default_model(run: RunReader, config: PipelineConfig, keeps: bool) -> str:
-    """What --model auto comes to.
+    """What --model auto comes to; a new shape that did not explain the frames better is not tried again.
 
     Args:
         run: The run.
         config: See `_settings_of_run`.
-        keeps: Whether the texture from the final refinement, if there is one, is what was asked for.
+        keeps: Whether a texture that the run has from its video already is what was asked for.
     """
     from tracking3d.reconstruction.final_shape import is_reconstructed
+    from tracking3d.results.layout import ONLINE
 
     if config.object.model is not None:
         return "none"
-    if is_reconstructed(run.frames, config):
+    refused = "shape" in run.description and not (run.mesh_folder / ONLINE).is_dir()
+    if is_reconstructed(run.frames, config) and not (keeps and refused):
         return "fine"
     refined = (run.description.get("refinement") or {}).get("frames")
     textured = run.config.get("object", {}).get("texture_views")
