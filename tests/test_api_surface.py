@@ -120,7 +120,6 @@ AT_LEAST = {
     "tracking3d.trackers.precomputed": "PrecomputedMasks",
     "tracking3d.trackers.protocol": "CorrectableTracker MaskTracker Options",
     "tracking3d.trackers.segmentation": "ColourSegmentation",
-    "tracking3d.pipeline.tracker_selection": "choose_tracker",
     "tracking3d.trackers.mask_from_points": "mask_from_points",
     "tracking3d.vot": "VotTracker",
 }

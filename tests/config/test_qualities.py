@@ -23,7 +23,7 @@ def test_good_is_what_is_used_when_nothing_is_said():
 
 def test_each_quality_looks_closer_than_the_one_before():
     configs = [load_config(quality=name) for name in list_qualities()]
-    assert [config.tracker.name for config in configs] == ["flow", "csrt", "auto"]
+    assert [config.tracker.name for config in configs] == ["flow", "auto", "auto"]
     assert [config.solver.final_refine for config in configs] == [False, True, True]
     assert [config.crop.size for config in configs] == sorted({config.crop.size for config in configs})
 

@@ -39,7 +39,7 @@ def test_what_came_of_it_is_said_and_kept(run, monkeypatch):
         lambda *given: asked.append(given) or SimpleNamespace(sentence="Better."),
     )
     assert make_final_shape(run, FINE, VIDEO) == "Better."
-    assert asked == [(run, VIDEO)]
+    assert asked == [(run, VIDEO, 24, 2048)]
     assert described(run) == {"state": "finished", "shape": "Better."}
 
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from tracking3d.config.choices import QUALITIES, check_quality
 from tracking3d.config.explain import describe_validation_error, format_value, hint
-from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
 from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError, argument
@@ -251,7 +251,7 @@ def _chosen_names(layer: Mapping[str, Any]) -> dict[str, Any]:
 def _merge(lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence[str] = ()) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
-    The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept. They are at the top level,
+    The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept, unless it was ``auto``. They are at the top level,
     where validation refuses null; further down, a section with all lines commented out changes nothing.
     """
     result = dict(lower)
@@ -260,7 +260,7 @@ def _merge(lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence
         if isinstance(below, dict) and value is None and not choices:
             continue
         if isinstance(below, dict) and isinstance(value, dict):
-            if key in choices and value.get("name", below["name"]) != below["name"]:
+            if key in choices and below["name"] not in (AUTO, value.get("name", below["name"])):
                 below = {}
             value = _merge(below, value)
         result[key] = value
