@@ -163,7 +163,7 @@ def test_config_show_is_a_configuration_file_with_every_default(call, tmp_path):
 
 
 def test_config_show_refuses_what_run_would_refuse(refused):
-    assert "did you mean 'padding'?" in refused("config", "show", "--set", "tracker.paddin=1")
+    assert "did you mean 'network'?" in refused("config", "show", "--set", "tracker.networ=1")
     assert "option 'path' is missing" in refused("config", "show", "--set", "tracker=precomputed")
 
 

@@ -65,7 +65,7 @@ def test_a_suite_is_run_printed_and_kept(call, clips, jobs):
     assert "0.930" in result.stdout
     kept = json.loads(Path("benchmark/results/default_masks_degraded_0_7-real.json").read_text())
     assert kept["mean"]["iou_mean"] == pytest.approx(0.93)
-    assert (kept["masks"], kept["config"]["tracker"]["name"]) == ("degraded:0.7", "csrt")
+    assert (kept["masks"], kept["config"]["tracker"]["name"]) == ("degraded:0.7", "auto")
 
 
 def test_a_sequence_that_fails_is_named_and_the_others_are_kept(call, clips, jobs):

@@ -351,7 +351,8 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
         ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),
         ("--box 1,1,9,9 --set solver.local_windo=9", "did you mean 'solver.local_window'?"),
-        ("--box 1,1,9,9 --set tracker.paddin=1", "did you mean 'padding'?"),
+        ("--box 1,1,9,9 --set tracker.networ=1", "mask tracker 'segment'"),
+        ("--box 1,1,9,9 --tracker csrt --set tracker.paddin=1", "did you mean 'padding'?"),
         ("--box 1,1,9,9 --set crop", "section.key=value"),
         ("--box 1,1,9,9 --config absent.yaml", "absent.yaml does not exist"),
         ("--box 1,1,9,9 --size 3", "'crop.size' must be greater than or equal to 32, not 3"),
@@ -432,7 +433,7 @@ def test_the_shape_is_made_anew_once_and_the_run_says_what_came_of_it(
     made = []
     monkeypatch.setattr(
         "tracking3d.reconstruction.rebuild.rebuild_shape",
-        lambda folder, source: made.append(folder) or SimpleNamespace(sentence="It is better."),
+        lambda folder, *_: made.append(folder) or SimpleNamespace(sentence="It is better."),
     )
     assert "It is better." in call("run", clip, *BOX, *options, "--out", "run").stdout
     assert json.loads(Path("run/run.json").read_text())["shape"] == "It is better."

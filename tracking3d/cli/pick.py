@@ -151,9 +151,8 @@ def _with_named_tracker(config: PipelineConfig, source: str, frames: str | None)
     from tracking3d.pipeline.tracker_selection import choose_tracker
     from tracking3d.video import open_source
 
-    if config.tracker.name != AUTO:
+    if config.tracker.name != AUTO or not (opened := open_source(source, frames)).repeatable:
         return config
-    opened = open_source(source, frames)
     first = next((frame for frame in opened if isinstance(frame, Frame)), None)
     return config if first is None else choose_tracker(config, opened.count, False, first.size)[0]
 

@@ -251,8 +251,9 @@ def _chosen_names(layer: Mapping[str, Any]) -> dict[str, Any]:
 def _merge(lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence[str] = ()) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
-    The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept, unless it was ``auto``. They are at the top level,
-    where validation refuses null; further down, a section with all lines commented out changes nothing.
+    The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept, unless the name was ``auto``.
+    They are at the top level, where validation refuses null; further down, a section with all lines commented out
+    changes nothing.
     """
     result = dict(lower)
     for key, value in upper.items():
