@@ -17,6 +17,8 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig, PaperConfig
 from tracking3d.evaluation.score import Scores
 from tracking3d.geometry.camera import Camera
+from tracking3d.picker.settings import TRACKER_FOR
+from tracking3d.pipeline.tracker_selection import CANDIDATES
 from tracking3d.rendering import prepare_backend
 from tracking3d.results import layout
 from tracking3d.results.description import RunHeader, description_at_start, summary
@@ -98,6 +100,25 @@ def flat(settings: dict[str, Any], prefix: str = ""):
             yield from flat(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/masks.md", "docs/how-to/scan.md"])
+def test_every_page_that_says_which_tracker_to_take_says_the_same(page):
+    table = re.search(
+        r"^\| what you film, or have \| `--tracker` \|\n\|---\|---\|\n((?:\|.*\n)+)",
+        (ROOT / page).read_text(encoding="utf-8"),
+        re.M,
+    )
+    assert table
+    assert table[1].splitlines() == [f"| {what} | `{name}` |" for name, what in TRACKER_FOR.items()]
+
+
+def test_the_page_on_masks_has_the_costs_that_auto_goes_by():
+    page = (ROOT / "docs/masks.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.+?) \| (\.\d{3}) \| ([\d.]+) \| .*\|$", page, re.M)
+    told = [(what, float(iou), float(seconds)) for what, iou, seconds in rows]
+    names = {"segment": "`segment`", "csrt": "`csrt`", "flow": "`flow`"}
+    assert told == [(names.get(one.name, one.what), one.iou, one.seconds) for one in CANDIDATES]
 
 
 def test_run_folder_page_names_every_file_and_key():

@@ -27,6 +27,7 @@ def test_the_choices_are_those_of_the_command_line(picker_with_settings):
         }
         assert set(choices[name]) - {"auto"} == installed - {"precomputed"}
     assert "auto" in choices["tracker"]
+    assert "an object in a hand" in told["tracker_for"]["segment"]
 
 
 def test_what_the_command_line_chose_is_chosen_and_what_follows_from_it_is_told(picker_with_settings):
@@ -83,10 +84,11 @@ def test_a_person_chooses_another_tracker_and_another_quality(picker_with_settin
         tracker = page.locator("[data-setting=tracker]")
         assert tracker.locator("option").first.inner_text() == "default (flow)"
         page.select_option("[data-setting=quality]", "good")
-        page.wait_for_selector("#source:has-text('tracker csrt')")
-        assert tracker.locator("option").first.inner_text() == "default (csrt)"
+        page.wait_for_selector("#source:has-text('tracker segment')")
+        assert tracker.locator("option").first.inner_text() == "default (segment)"
         page.select_option("[data-setting=tracker]", "flow")
         page.wait_for_selector("#source:has-text('tracker flow')")
+        page.wait_for_selector("#tracker-for:has-text('flow: an object on a turntable')")
         page.fill("[data-setting=fov]", "500")
         page.dispatch_event("[data-setting=fov]", "change")
         page.wait_for_selector("#status.problem:has-text('The settings are as before')")

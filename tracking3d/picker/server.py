@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
-from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words
+from tracking3d.picker.settings import TRACKER_FOR, parse_settings, setting_choices, settings_in_words
 from tracking3d.web.access import SAFE_HEADERS, Access
 from tracking3d.web.connections import Connections, TimedReader
 
@@ -286,6 +286,7 @@ def _describe(session: PickingSession) -> dict[str, Any]:
         "height": session.height,
         "tracker": session.config.tracker.name,
         "choices": setting_choices(session.config) if session.menu else None,
+        "tracker_for": TRACKER_FOR,
         **_describe_settings(session),
     }
 

@@ -9,11 +9,19 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tracking3d.config.choices import MODELS, QUALITIES
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.plugins import FEATURES, TRACKERS, list_plugins
 
-_BEST = "auto"  # the tracker that stands for the best one
+TRACKER_FOR = {
+    "segment": "an object in a hand, a vehicle, most real videos; the default where no network was downloaded",
+    "auto": "the best masks, by networks that `tracking3d models get recommended` downloads (7 MB); the default from "
+    "then on",
+    "flow": "an object on a turntable, or one that moves by itself, with nothing that moves along",
+    "csrt": "an object that looks like its background, if other masks spread over it",
+    "precomputed": "masks of all frames that another program has made (`--masks`)",
+}
+"""What each mask tracker is for; the documentation has the same table."""
 _NEEDS_FILES = "precomputed"
 """The tracker whose masks lie in a folder, which a page cannot choose."""
 
@@ -66,7 +74,7 @@ def setting_choices(config: PipelineConfig) -> dict[str, list[str]]:
     trackers = [one.name for one in usable if one.group == TRACKERS and one.name != _NEEDS_FILES]
     features = [one.name for one in usable if one.group == FEATURES]
     return {
-        "tracker": list(dict.fromkeys([_BEST, config.tracker.name, *trackers])),
+        "tracker": list(dict.fromkeys([AUTO, config.tracker.name, *trackers])),
         "quality": list(QUALITIES),
         "model": list(MODELS),
         "features": list(dict.fromkeys([config.features.name, *features])),

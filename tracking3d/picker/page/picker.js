@@ -376,6 +376,8 @@ function showSettings() {
     const unchosen = control.options?.[0];
     if (unchosen) unchosen.textContent = session.usual[name] && !value ? `default (${session.usual[name]})` : UNCHOSEN[name] ?? "default";
   }
+  const named = session.chosen.tracker ?? session.tracker, use = session.tracker_for[named];
+  byId("tracker-for").textContent = use ? `${named}: ${use}` : "";
   byId("source").textContent = `${session.source}, ${session.width} x ${session.height}, tracker ${session.tracker}`;
 }
 
