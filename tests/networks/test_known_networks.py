@@ -38,8 +38,12 @@ def test_some_network_forbids_commercial_use_and_says_so():
     assert [network.name for network in known_networks().values() if network.non_commercial] == ["rmbg-1.4"]
 
 
+UNUSED = {"edgepoint2_m64.onnx", "edgepoint2_t32.onnx"}
+"""Keypoint networks, for which the product has no plug-in: the catalogue would promise what it cannot run."""
+
+
 def test_the_catalogue_knows_the_development_files(shared_models: Path):
-    files = sorted(shared_models.glob("*.onnx"))
+    files = sorted(file for file in shared_models.glob("*.onnx") if file.name not in UNUSED)
     assert files
     known = {(network.size, network.sha256) for network in known_networks().values()}
     for file in files:
