@@ -14,6 +14,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, Prompt
+from tracking3d.pipeline.tracker_selection import check_tracker_options
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, check_options
 from tracking3d.synthesis.convex_clips import SyntheticClip
 from tracking3d.trackers.protocol import MaskTracker
@@ -74,5 +75,5 @@ def test_documented_configurations_are_valid(page, tmp_path):
         file = tmp_path / "documented.yaml"
         file.write_text(block, encoding="utf-8")
         config = load_config(file)
-        check_options(TRACKERS, config.tracker)
+        check_tracker_options(config)
         check_options(FEATURES, config.features)

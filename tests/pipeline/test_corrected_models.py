@@ -63,7 +63,7 @@ def rebuilt(run, monkeypatch) -> list[Path]:
     """The run as `tracking3d model --quality fine` leaves it; the folders whose shape is reconstructed from then on."""
     folders = []
 
-    def reconstruct(folder: Path, source) -> SimpleNamespace:
+    def reconstruct(folder: Path, source, *limits: int) -> SimpleNamespace:
         folders.append(folder)
         (folder / layout.ONLINE).mkdir(exist_ok=True)
         for into in (folder / layout.ONLINE, folder):

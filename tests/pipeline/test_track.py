@@ -254,7 +254,7 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
 
     monkeypatch.setattr("tracking3d.pipeline.open_tracking.Session", Recorder)
     assert list(track(clip.images, box=clip.box)) == [0, 1, 2, 3]
-    assert used == [load_config(preset="default")]
+    assert used == [load_config(preset="default", tracker="segment")]  # what auto comes to
     assert used[0].solver.name == "online"
 
 
