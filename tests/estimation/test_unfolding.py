@@ -77,3 +77,9 @@ def test_a_prototype_is_placed_on_a_mask_that_has_moved_turned_and_grown(degrees
     faces = torch.from_numpy(mesh.faces)
     drawn = rasterize(screen, depth, faces, later.shape, "auto").face_index[0].numpy() >= 0
     assert (drawn & later).sum() / (drawn | later).sum() > 0.9
+
+
+def test_the_direction_of_what_is_round_is_not_taken_for_a_turn() -> None:
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    pose = place_on_mask(SPHERE.rest, CAMERA, np.hypot(x - 70, 1.04 * (y - 60)) < 25)
+    assert torch.equal(pose.R, torch.eye(3))

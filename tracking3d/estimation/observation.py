@@ -60,8 +60,8 @@ class Observation:
     def outline_distance(self) -> Tensor:
         """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`.
 
-        Behind an occluder the outline is that of the mask's convex hull, at a lower weight: a surface that were free
-        there would grow sheets, and the occluder's outline is not the object's.
+        Behind an occluder the outline is that of the mask's convex hull, at a lower weight: a surface that is free
+        there grows sheets, and the occluder's outline is not the object's.
         """
         if self.occluder is None or not self.has_mask:
             return outline_distance(self.mask, self.valid)

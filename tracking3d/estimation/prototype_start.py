@@ -24,6 +24,7 @@ from tracking3d.geometry.prototypes import ellipsoid, from_file, sphere
 
 RADIUS = 0.9
 """Radius of the object's largest half-axis in object units."""
+_ELONGATED = 1.1  # ratio of an ellipse's axes from which its direction is known (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +86,12 @@ def place_on_mask(rest: Tensor, camera: Camera, mask: NDArray[np.bool_]) -> Pose
         mask: ``(H, W)``, not empty.
     """
     ellipse = mask_ellipse(mask)
-    _, directions = np.linalg.eigh(np.cov(rest[:, :2].double().cpu().numpy().T))
+    variances, directions = np.linalg.eigh(np.cov(rest[:, :2].double().cpu().numpy().T))
     (x0, y0), (x1, y1) = directions[:, 1], ellipse.directions[:, 0]
     turn = math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1))
     turn = (turn + 90) % 180 - 90  # an ellipse looks the same after half a turn
+    if min(variances[1] / variances[0], np.divide(*ellipse.semi_axes) ** 2) < _ELONGATED**2:
+        turn = 0.0  # the axes of what is nearly round point anywhere
     translation = rest.new_tensor(first_translation(ellipse, camera))
     return from_matrix(rotation_about(rest.new_tensor([0.0, 0.0, 1.0]), turn), translation)
 

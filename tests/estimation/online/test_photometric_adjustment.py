@@ -25,6 +25,7 @@ from tracking3d.estimation.online.optimization.shading import (
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.shape import unfold
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.rendering import render
 
@@ -209,3 +210,14 @@ def test_a_view_without_a_mask_takes_part_by_what_it_shows() -> None:
     )
     assert np.isfinite(cost)
     assert errors(found)[2] < 2.0
+
+
+def test_a_fit_does_not_keep_a_fold() -> None:
+    truth = turned_map(ANGLES)
+    vertices = truth.vertices.clone()
+    near = torch.exp(-vertices[:, :2].square().sum(1) / 0.1) * (vertices[:, 2] > 0)
+    vertices[:, 0] += 1.6 * near
+    folded = replace(truth, vertices=vertices)
+    assert not torch.equal(unfold(truth.shape, vertices), vertices)
+    fitted, _ = fit_jointly(folded, ShapeBasis.of(truth.shape), WEIGHTS, 6)
+    assert torch.equal(unfold(truth.shape, fitted.vertices), fitted.vertices)

@@ -8,6 +8,7 @@ import torch
 from turned_solid import CAMERA, SIZE, degrees_apart, turned_map
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.initialization import initial_map
 from tracking3d.estimation.online.initialization.initial_map import initialize_without_points
 from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
@@ -15,6 +16,7 @@ from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     rotation_hypotheses,
 )
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.geometry.pose import Pose
 
 
 def box_mask(left: int, top: int, side: int) -> np.ndarray:
@@ -50,6 +52,20 @@ def test_translations_follow_the_masks() -> None:
     assert float(rotation_hypotheses(views, CAMERA)[0][1][1].translation[2]) == pytest.approx(2 * depth)
     views[1] = replace(second, mask=None)
     assert torch.equal(rotation_hypotheses(views, CAMERA)[0][1][1].translation, first.pose.translation)
+
+
+def test_a_start_without_points_begins_where_the_object_is_by_then(monkeypatch) -> None:
+    truth = turned_map([0.0, 7.0, 14.0, 21.0])
+    beside = Pose(
+        truth.keyframes[0].pose.translation + torch.tensor([1.5, -1.0, 2.0]), torch.tensor([1.0, 0, 0, 0])
+    )
+    views = [replace(view, pose=beside) for view in truth.keyframes]
+    monkeypatch.setattr(initial_map, "fit_jointly", lambda object_map, *_: (object_map, 0.0))
+    (start,) = initialize_without_points(replace(truth, keyframes=()), CAMERA, views, FitWeights())
+    first = start.object_map.keyframes[0]
+    assert first.mask is not None
+    drawn = truth.silhouette(first.pose, CAMERA)
+    assert (drawn & first.mask).sum() / (drawn | first.mask).sum() > 0.7
 
 
 @pytest.mark.slow
