@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.results.run_reader import RunReader
 
-Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
-
 
 def _refuse_quality(value: str | None) -> None:
     """Answer the former option ``--quality fast|fine``."""

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.model import Largest
 from tracking3d.cli.options import AsJson, Debug
 from tracking3d.cli.options.panels import DATA
 from tracking3d.errors import InputError
@@ -43,7 +42,9 @@ def score_models(
             rich_help_panel=DATA,
         ),
     ] = None,
-    largest: Largest = 2048,
+    largest: Annotated[
+        int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")
+    ] = 2048,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
