@@ -38,8 +38,9 @@ def estimate_pending_frames(
 ) -> tuple[SolverState, list[FrameEstimate]]:
     """Estimate all pending frames with the first map, one after the other.
 
-    The map may have been made from the first of them only. Those after these that show something new become keyframes,
-    so that their points are landmarks by the time that the last frame is reached.
+    The map may have been made from some of them only. Those before these are estimated backwards in time. Those after
+    these that show something new become keyframes, so that their points are landmarks by the time that the last frame
+    is reached.
 
     Args:
         state: The state with the first map, as it was refined.
@@ -51,10 +52,15 @@ def estimate_pending_frames(
     """
     poses = {view.index: view.pose for view in state.object_map.keyframes}
     first = state.object_map.keyframes[0]
-    state, revised, trail = _estimate_in_turn(
-        state, waiting, (first.pose, first.index), poses, start.origin, before, config, weights
+    known = first.pose, first.index
+    earlier = [one for one in waiting if one[0].index < first.index]
+    state, backwards, _ = _estimate_in_turn(
+        state, earlier[::-1], known, poses, start.origin, before, config, weights
     )
-    return replace(state, previous_pose=trail[-2]), revised
+    state, revised, trail = _estimate_in_turn(
+        state, waiting[len(earlier) :], known, poses, start.origin, before, config, weights
+    )
+    return replace(state, previous_pose=trail[-2]), [*backwards[::-1], *revised]
 
 
 def estimate_arrived_frames(
@@ -132,6 +138,8 @@ def _estimate_in_turn(
             estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
         revised.append(estimate)
         state = learn_colours(state, revised[-1], found)
+    if not trail:
+        return state, revised, trail
     return replace(
         state, last_pose=trail[-1], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]), baseline=usual,
         tracked_points=view.points,

@@ -85,13 +85,18 @@ class MapInitialization(MapExtension):
         """Make the first map, and estimate all pending frames with it."""
         assert state.pending is not None
         everything = list(range(len(start.object_map.keyframes)))
-        waiting, before, camera = state.pending, state.camera, start.camera
+        waiting, before, camera = (*state.rested, *state.pending), state.camera, start.camera
         with in_stage("map"):
             object_map = refine_local_map(
                 start.object_map, camera, everything, self.online, bundle_iterations=20, rounds=3
             )
             updated = replace(
-                state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
+                state,
+                camera=camera,
+                object_map=object_map,
+                surface=object_map.surface(),
+                pending=None,
+                rested=(),
             )
             updated = refine_by_landmarks(updated, self.online)
             if self.config.has_given_masks:
@@ -141,6 +146,7 @@ class MapInitialization(MapExtension):
                 state,
                 object_map=replace(state.object_map, started_at_rest=at_rest),
                 pending=(*found.pending, *outcome.left),
+                rested=found.rested,
                 next_attempt=found.next_attempt,
                 ambiguous_frames=found.ambiguous_frames,
                 ambiguous_rotation=found.ambiguous_rotation,

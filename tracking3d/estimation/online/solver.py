@@ -47,6 +47,7 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     needs_second_map,
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.initialization.initial_map import begin_again
 from tracking3d.estimation.online.initialization.initializer import try_initialize
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
@@ -56,6 +57,7 @@ from tracking3d.estimation.online.mapping.keyframe_views import cut_around_objec
 from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
 from tracking3d.estimation.online.masks.mask_agreement import mask_agreement
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
@@ -153,7 +155,10 @@ class OnlineSolver(MapInitialization):
         state = activate_largest_map(
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
         )
-        object_map, camera = refine_globally(state.object_map, state.camera, self.online)
+        object_map, camera = state.object_map, state.camera
+        if object_map.pointless and not object_map.fixed_keyframes:
+            object_map = begin_again(object_map, camera, FitWeights(smoothness=self.online.smoothness))
+        object_map, camera = refine_globally(object_map, camera, self.online)
         if self.config.has_given_masks:
             state = replace(state, mask_agreement=mask_agreement(object_map, camera))
         return replace(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,11 @@ from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.estimation.observation import downsample
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
-from tracking3d.estimation.online.initialization.rotation_hypotheses import rotation_hypotheses
+from tracking3d.estimation.online.initialization.rotation_hypotheses import (
+    reverse_rotations,
+    rotation_hypotheses,
+    vary_rotations,
+)
 from tracking3d.estimation.online.initialization.structure_from_motion import structure_hypotheses
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape, tracks_of
@@ -20,11 +25,11 @@ from tracking3d.estimation.online.mapping.photometric_adjustment import fit_join
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.prototype_start import RADIUS, place_on_mask
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
+from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays, rotation_angle
 
 _VIEWS = 8
 _ROTATION_FRAMES = (
@@ -37,8 +42,14 @@ _MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
     6,
     2.0,
 )  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
-# Stages: hypotheses that continue, evaluations, half resolution.
-_STAGES = ((99, 5, True), (5, 12, True), (3, 10, False))
+_FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
+_VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted to the end (measured)
+_STAGES = ((8, True), (5, False))  # evaluations of the survivors, and whether at half resolution
+_LAST_EVALUATIONS = 5  # of the best one
+_VIEWS_AGAIN = 12  # keyframes from which a map is begun again (chosen)
+_CLEARLY_BETTER = 0.95  # share of the present map's cost (chosen)
+_SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
+_MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +62,7 @@ class InitialMap:
         bundle: Cost of the points' reprojection.
         origin: The hypothesis that it came from.
         camera: The camera that it was estimated with.
+        overlap: Mean IoU of the silhouettes with the masks.
     """
 
     object_map: ObjectMap
@@ -58,6 +70,7 @@ class InitialMap:
     bundle: float
     origin: str
     camera: Camera
+    overlap: float = 1.0
 
 
 def solve_start(
@@ -130,7 +143,8 @@ def initialize_without_points(
 ) -> list[InitialMap]:
     """The best initial map by pixels and outlines alone, from the first views.
 
-    Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`; the better ones continue.
+    Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`, and again from rotations near
+    the best of them, see `vary_rotations`; the better ones continue.
 
     Args:
         object_map: Prototype and landmarks; its keyframes are not used.
@@ -142,27 +156,104 @@ def initialize_without_points(
     chosen = _spread_views(near if len(near) >= _MIN_ROTATION_VIEWS else views, _ROTATION_VIEWS)
     if (mask := chosen[0].mask) is not None and mask.any():  # the object may have moved since the first frame
         chosen[0] = replace(chosen[0], pose=place_on_mask(object_map.shape.rest, camera, mask))
-    modes = ShapeBasis.of(object_map.shape)
-    tried = [
-        (math.inf, name, replace(object_map, keyframes=_with_poses(chosen, poses)))
-        for name, poses in rotation_hypotheses(chosen, camera)
+    fit = partial(_fit_hypotheses, ShapeBasis.of(object_map.shape), weights, chosen)
+
+    def posed(name: str, poses: list[Pose]) -> _Fitted:
+        return math.inf, replace(object_map, keyframes=_with_poses(chosen, poses)), name
+
+    tried = fit([posed(*one) for one in rotation_hypotheses(chosen, camera)], _FIRST_EVALUATIONS, True)
+    tried = _distinct(tried, _VARIED)
+    varied = [
+        posed(name, poses)
+        for _, found, name in tried
+        for poses in vary_rotations(chosen, [view.pose for view in found.keyframes], camera)
     ]
-    for survivors, iterations, coarse in _STAGES:
-        better = []
-        for _, name, candidate in tried[:survivors]:
-            fitted, cost = fit_jointly(
-                with_observations(candidate, chosen, coarse), modes, weights, iterations
-            )
-            better.append((cost, name, fitted))
-        tried = sorted(better, key=lambda one: one[0])
-    _, name, found = tried[0]
+    tried = _distinct([*tried, *fit(varied, _FIRST_EVALUATIONS, True)], _SURVIVORS)
+    for evaluations, coarse in _STAGES:
+        tried = fit(tried, evaluations, coarse)
+    ((_, found, name),) = fit(tried[:1], _LAST_EVALUATIONS, False)
     found = _without_points(found)
-    surface = found.surface()
-    fits = [
+    fits = _fits_of(found)
+    cost, overlap = (float(np.mean([getattr(one, part) for one in fits])) for part in ("cost", "overlap"))
+    return [InitialMap(found, cost, 0.0, name, camera, overlap)]
+
+
+def begin_again(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> ObjectMap:
+    """A map without points from the same keyframes, begun again with other rotations, if it explains them better.
+
+    More views tell hypotheses apart that the first views do not. The present rotations compete, the reversed ones, and
+    those near both; the shape begins as the prototype. At most `_VIEWS_AGAIN` keyframes stay.
+
+    Args:
+        object_map: The map.
+        camera: The camera of the full frame.
+        weights: The weights of the shape's terms.
+    """
+    chosen = _spread_views([view for view in object_map.keyframes if view.mask is not None], _VIEWS_AGAIN)
+    if len(chosen) < _MIN_ROTATION_VIEWS:
+        return object_map
+    fit = partial(_fit_hypotheses, ShapeBasis.of(object_map.shape), weights, chosen)
+    present = [view.pose for view in chosen]
+    reverse = reverse_rotations(chosen, camera)
+    poses = [present, reverse]
+    poses += [one for other in (present, reverse) for one in vary_rotations(chosen, other, camera)]
+    blank = replace(object_map, vertices=object_map.shape.rest)
+    tried = fit(
+        [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses],
+        _FIRST_EVALUATIONS,
+        True,
+    )
+    tried = _distinct(tried, _SURVIVORS)
+    for evaluations, coarse in _STAGES:
+        tried = fit(tried, evaluations, coarse)
+    as_it_is = replace(object_map, keyframes=_with_poses(chosen, present))
+    ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
+    cost, found, _ = tried[0]
+    return _without_points(found) if cost < _CLEARLY_BETTER * before else object_map
+
+
+_Fitted = tuple[float, ObjectMap, str]
+
+
+def _fit_hypotheses(
+    modes: ShapeBasis,
+    weights: FitWeights,
+    views: list[Keyframe],
+    tried: list[_Fitted],
+    evaluations: int,
+    coarse: bool,
+) -> list[_Fitted]:
+    """Shape and poses of each hypothesis fitted to the views a little further, by rising cost."""
+    fitted = []
+    for _, hypothesis, name in tried:
+        found, cost = fit_jointly(with_observations(hypothesis, views, coarse), modes, weights, evaluations)
+        missed = 1 - float(np.mean([fit.overlap for fit in _fits_of(found)]))
+        fitted.append((cost + _MISSED * missed, found, name))
+    return sorted(fitted, key=lambda one: one[0])
+
+
+def _distinct(fitted: list[_Fitted], most: int) -> list[_Fitted]:
+    """The best hypotheses of which no two turn alike from the first view to the last."""
+    found: list[_Fitted] = []
+    for one in sorted(fitted, key=lambda one: one[0]):
+        if all(_degrees_apart(one[1], other[1]) > _SAME_ROTATION for other in found):
+            found.append(one)
+    return found[:most]
+
+
+def _degrees_apart(one: ObjectMap, other: ObjectMap) -> float:
+    """How far two maps of the same views differ in the last view's rotation; the first one's is the same."""
+    last, there = one.keyframes[-1].pose, other.keyframes[-1].pose
+    return math.degrees(float(rotation_angle(last.quaternion, there.quaternion)))
+
+
+def _fits_of(object_map: ObjectMap) -> list[PoseFit]:
+    """The losses of a map's keyframes."""
+    surface = object_map.surface()
+    return [
         refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
-        for view in found.keyframes
+        for view in object_map.keyframes
     ]
-    return [InitialMap(found, float(np.mean([fit.cost for fit in fits])), 0.0, name, camera)]
 
 
 def _spread_views(views: list[Keyframe], most: int) -> list[Keyframe]:

@@ -57,9 +57,11 @@ _MIN_OUTLINE_CHANGE, _MIN_SHADING_CHANGE = 0.05, 0.004  # see `ImageChange`; the
 _MIN_LEAD, _MIN_LEAD_AGAIN = 0.04, 0.02
 _DECISIVE_MOTION = 0.3  # deformation from which more motion decides nothing
 _WELL_TRACKED = 0.25  # bundle cost of points that are tracked well
+_MIN_OVERLAP = 0.7  # IoU with the masks, below which a map without points is not accepted (chosen)
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
 _NOT_MOVED = "the object has not moved yet"
+_NO_SHAPE = "no shape that was tried so far covers the masks of the frames"
 _STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
 
 
@@ -193,8 +195,7 @@ def _start_of_plain_object(
     if last_still is not None and last_still >= _LONG_STILL:
         views = views[last_still:]
         if len(views) < _MIN_FRAMES_WITHOUT_POINTS and not ended:
-            kept = tuple(one for one in state.pending or () if one[0].index >= views[0].index)
-            return replace(state, pending=kept, waiting_reason="", ambiguous_frames=0), None
+            return replace(_set_aside(state, views[0].index), waiting_reason="", ambiguous_frames=0), None
     return _start_without_points(state, views, config)
 
 
@@ -206,9 +207,23 @@ def _start_without_points(
     if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= _MAX_PENDING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
-    return state, initialize_without_points(
+    start = initialize_without_points(
         state.object_map, state.camera, views, FitWeights(smoothness=config.smoothness)
     )[0]
+    if start.overlap >= _MIN_OVERLAP:
+        return state, start
+    # Another window may show more of the shape.
+    later = views[min(_RETRY_INTERVAL, len(views) - 1)].index
+    return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0), None
+
+
+def _set_aside(state: SolverState, first: int) -> SolverState:
+    """The state whose first map is made without the pending frames before the one of index ``first``."""
+    waiting = state.pending or ()
+    rested = (*state.rested, *(one for one in waiting if one[0].index < first))
+    while len(rested) > _MAX_PENDING:
+        rested = _subsample(rested)
+    return replace(state, rested=rested, pending=tuple(one for one in waiting if one[0].index >= first))
 
 
 def _is_undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.float64] | None) -> bool:

@@ -206,8 +206,10 @@ def _step(
     )
     vertices = state.vertices + (problem.modes.vectors @ shape.reshape(-1, 3)).to(state.vertices)
     vertices = unfold(problem.object_map.shape, vertices)
-    moved = [_update_pose(state.poses[n], part) for n, part in enumerate(poses.reshape(-1, 6).to(vertices))]
-    return _evaluate(problem, vertices, Pose.stack(moved))
+    # Steps (v, w) in the camera's axes, about the poses' own translations.
+    moving, turning = poses.reshape(-1, 6).to(vertices).split(3, dim=1)
+    moved = from_matrix(rotation_exponential(turning) @ state.poses.R, state.poses.translation + moving)
+    return _evaluate(problem, vertices, moved)
 
 
 def _evaluate(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
@@ -273,8 +275,3 @@ def _outline_rows(problem: _Problem, outlines: _Outlines, R: Tensor, t: Tensor) 
     jacobian = torch.cat([by_mode, by_poses.flatten(1)], 1)
     square = problem.weights.outline_scale**2
     return jacobian, jacobian * (2 * outlines.weight / (1 + residual.square() / square))[:, None]
-
-
-def _update_pose(pose: Pose, step: Tensor) -> Pose:
-    """The pose after a step (v, w) in the camera's axes about its own translation."""
-    return from_matrix(rotation_exponential(step[3:]) @ pose.R, pose.translation + step[:3])

@@ -85,6 +85,7 @@ class SolverState:
         grey: ``(H, W)`` the last frame.
         tracked_points: Points in the last frame.
         pending: The frames that wait for the first map, with their estimates so far; None once there is a map.
+        rested: Frames before those, in which the object did not turn yet; they get a pose from the first map too.
         feature_space: The projection of the encoder's features; None leaves them as they are.
         next_attempt: The motion at which the next initialization is tried.
         ambiguous_frames: How many frames the last initialization had if it was ambiguous; 0 if there was none.
@@ -120,6 +121,7 @@ class SolverState:
     grey: NDArray[np.uint8]
     tracked_points: FollowedPoints
     pending: tuple[tuple[Keyframe, FrameEstimate], ...] | None = ()
+    rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     feature_space: FeatureSpace | None = None
     next_attempt: float = 0.0
     ambiguous_frames: int = 0
