@@ -75,6 +75,26 @@ def test_frames_after_those_of_the_start_become_keyframes_and_their_points_landm
     assert largest_error(estimates) < 25
 
 
+def test_frames_before_those_of_the_start_are_estimated_backwards_in_time(monkeypatch):
+    skipped = 5
+
+    def wait(
+        state: SolverState, config: OnlineConfig, ended: bool = False
+    ) -> tuple[SolverState, InitialMap | None]:
+        assert state.pending is not None
+        if len(state.pending) < skipped + SOLVED:
+            return state, None
+        later = replace(state, rested=state.pending[:skipped], pending=state.pending[skipped:])
+        return try_initialize(later, config, ended=True)
+
+    monkeypatch.setattr(map_initialization, "try_initialize", wait)
+    state, estimates = run_clip()
+    assert state.rested == ()
+    assert [estimate.index for estimate in estimates] == list(range(FRAMES))
+    assert state.object_map.keyframes[0].index == skipped
+    assert largest_error(estimates) < 8
+
+
 @pytest.mark.usefixtures("late_start")
 def test_without_them_the_last_frame_shows_hardly_a_landmark(monkeypatch):
     """The object turns far enough for the test above to fail if nothing is inserted."""

@@ -256,6 +256,22 @@ def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked
     assert not asked["points"]
 
 
+def test_a_map_without_points_that_misses_its_masks_is_not_accepted(asked, monkeypatch):
+    given = belief_of(list(np.linspace(0, 60, 13)))
+    plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)
+
+    def missing(object_map, camera, views, weights):
+        return [InitialMap(object_map, 0.1, 0.0, "turning", camera, overlap=0.6)]
+
+    monkeypatch.setattr(initializer, "initialize_without_points", missing)
+    state, start = try_initialize(replace(given, pending=plain), CONFIG)
+    assert start is None
+    assert "masks" in state.waiting_reason
+    # Later frames get another chance; those before them still get a pose in the end.
+    assert len(state.pending) == 8
+    assert [*state.rested, *state.pending] == list(plain)
+
+
 def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):
     given = belief_of(STEADY)
     first, *others = given.pending

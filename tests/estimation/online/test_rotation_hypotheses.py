@@ -9,14 +9,17 @@ from turned_solid import CAMERA, SIZE, degrees_apart, turned_map
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.initialization import initial_map
-from tracking3d.estimation.online.initialization.initial_map import initialize_without_points
+from tracking3d.estimation.online.initialization.initial_map import begin_again, initialize_without_points
 from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
     TURNS,
+    reverse_rotations,
     rotation_hypotheses,
+    vary_rotations,
 )
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.geometry.pose import Pose
+from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 
 def box_mask(left: int, top: int, side: int) -> np.ndarray:
@@ -66,6 +69,88 @@ def test_a_start_without_points_begins_where_the_object_is_by_then(monkeypatch) 
     assert first.mask is not None
     drawn = truth.silhouette(first.pose, CAMERA)
     assert (drawn & first.mask).sum() / (drawn | first.mask).sum() > 0.7
+
+
+def test_varied_rotations_are_near_the_one_they_come_from_and_keep_the_first_view() -> None:
+    views = list(turned_map([0.0, 20.0, 40.0]).keyframes)
+    poses = [view.pose for view in views]
+    varied = vary_rotations(views, poses, CAMERA)
+    assert all(degrees_apart(one[0], poses[0]) == pytest.approx(0.0, abs=0.1) for one in varied)
+    extents = sorted(degrees_apart(one[2], one[0]) for one in varied)
+    assert extents[0] == pytest.approx(0.6 * 40, abs=0.1)
+    assert extents[-1] == pytest.approx(1.6 * 40, abs=0.1)
+    apart = [degrees_apart(one[2], poses[2]) for one in varied]
+    assert all(10 < angle < 30 for angle in apart)
+
+
+def test_a_reversed_rotation_has_the_same_outlines_of_a_distant_object() -> None:
+    views = list(turned_map([0.0, 15.0, 30.0]).keyframes)
+    reverse = reverse_rotations(views, CAMERA)
+    assert degrees_apart(reverse[2], views[0].pose) == pytest.approx(30.0, abs=0.1)
+    assert degrees_apart(reverse[2], views[2].pose) == pytest.approx(60.0, abs=0.1)
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(3))
+    for view, other in zip(views, reverse, strict=True):
+        there = points @ view.pose.R.T
+        reflected = points @ flip @ other.R.T
+        assert torch.allclose(there[:, :2], reflected[:, :2], atol=1e-4)
+
+
+def test_a_rotation_between_the_directions_that_are_tried_is_found() -> None:
+    truth = turned_map([0.0, 9.0, 18.0, 27.0, 36.0])
+    roll = rotation_about(torch.tensor([0.0, 0.0, 1.0]), 70.0)
+    views = [replace(view, pose=from_matrix(roll, view.pose.translation)) for view in truth.keyframes]
+    # What the fit is asked for: a turn about none of the eight axes.
+    wanted = [views[0].pose] + [
+        from_matrix(rotation_about(torch.tensor([1.0, 0.4, 0.0]), angle) @ roll, views[0].pose.translation)
+        for angle in (5.0, 10.0, 15.0, 20.0)
+    ]
+
+    def off(object_map: ObjectMap) -> float:
+        return sum(
+            degrees_apart(view.pose, pose) for view, pose in zip(object_map.keyframes, wanted, strict=True)
+        )
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(initial_map, "place_on_mask", lambda *_: views[0].pose)
+        patch.setattr(initial_map, "fit_jointly", lambda object_map, *_: (object_map, off(object_map)))
+        (start,) = initialize_without_points(replace(truth, keyframes=()), CAMERA, views, FitWeights())
+        best = min(
+            off(replace(truth, keyframes=initial_map._with_poses(views, poses)))
+            for _, poses in rotation_hypotheses(views, CAMERA)
+        )
+    assert off(start.object_map) < 0.3 * best
+
+
+def map_astray(truth: ObjectMap) -> ObjectMap:
+    """The prototype at poses that turn in the other sense."""
+    poses = reverse_rotations(list(truth.keyframes), CAMERA)
+    keyframes = (replace(view, pose=pose) for view, pose in zip(truth.keyframes, poses, strict=True))
+    return replace(truth, vertices=truth.shape.rest, keyframes=tuple(keyframes), pointless=True)
+
+
+def test_a_map_is_begun_again_only_if_that_is_clearly_better(monkeypatch) -> None:
+    truth = turned_map([0.0, 10.0, 20.0, 30.0, 40.0])
+    astray, base = map_astray(truth), [100.0]
+
+    def off(object_map: ObjectMap, *_) -> tuple[ObjectMap, float]:
+        pairs = zip(object_map.keyframes, truth.keyframes, strict=True)
+        return object_map, base[0] + sum(degrees_apart(a.pose, b.pose) for a, b in pairs)
+
+    monkeypatch.setattr(initial_map, "fit_jointly", off)
+    found = begin_again(astray, CAMERA, FitWeights())
+    assert degrees_apart(found.keyframes[-1].pose, truth.keyframes[-1].pose) < 1
+    base[0] = 1e5
+    assert begin_again(astray, CAMERA, FitWeights()) is astray
+
+
+@pytest.mark.slow
+def test_a_map_that_turns_the_wrong_way_is_begun_again() -> None:
+    truth = turned_map([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+    found = begin_again(map_astray(truth), CAMERA, FitWeights(smoothness=30.0))
+    assert degrees_apart(found.keyframes[-1].pose, truth.keyframes[-1].pose) < 30  # of 120 before
+    right = replace(truth, pointless=True)
+    assert begin_again(right, CAMERA, FitWeights(smoothness=30.0)) is right
 
 
 @pytest.mark.slow
