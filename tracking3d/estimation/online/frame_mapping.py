@@ -17,7 +17,7 @@ from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_l
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
 from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
 from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
-from tracking3d.estimation.online.state.confidence import is_high_loss
+from tracking3d.estimation.online.state.confidence import is_high_loss, is_misfit
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import (
@@ -50,6 +50,9 @@ class FrameMapping(ContinuedRefinement):
         updated = advance(state, found, pose, image)
         if usual and not found.lost:
             updated = replace(updated, baseline=state.baseline.update(found.fit))
+        if state.object_map.pointless:
+            misfit = is_misfit(found.fit, state.baseline)
+            updated = replace(updated, misfits=state.misfits + 1 if misfit else 0)
         if is_keyframe:
             view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):

@@ -48,7 +48,7 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import begin_again
-from tracking3d.estimation.online.initialization.initializer import try_initialize
+from tracking3d.estimation.online.initialization.initializer import restart_misfit, try_initialize
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
@@ -135,6 +135,8 @@ class OnlineSolver(MapInitialization):
         frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
+        if not self.in_background:  # a live source would wait for seconds
+            state = restart_misfit(state, self.online)
         state, estimate = self._track(state, frame, image, binary)
         if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)

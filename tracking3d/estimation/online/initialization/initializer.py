@@ -19,6 +19,7 @@ from tracking3d.estimation.online.features.texture_strength import PLAIN, textur
 from tracking3d.estimation.online.initialization.image_change import image_change
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
+    begin_again,
     initialize_without_points,
     solve_start,
 )
@@ -26,6 +27,7 @@ from tracking3d.estimation.online.initialization.structure_from_motion import im
 from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses
 from tracking3d.estimation.online.mapping.local_mapping import tracks_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 
@@ -57,6 +59,8 @@ _MIN_OUTLINE_CHANGE, _MIN_SHADING_CHANGE = 0.05, 0.004  # see `ImageChange`; the
 _MIN_LEAD, _MIN_LEAD_AGAIN = 0.04, 0.02
 _DECISIVE_MOTION = 0.3  # deformation from which more motion decides nothing
 _WELL_TRACKED = 0.25  # bundle cost of points that are tracked well
+_LASTING_MISFIT = 5  # frames in a row, see `is_misfit` (chosen)
+_MOST_RESTARTS = 2  # while frames come; once more after the last one
 _MIN_OVERLAP = 0.7  # IoU with the masks, below which a map without points is not accepted (chosen)
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
@@ -215,6 +219,34 @@ def _start_without_points(
     # Another window may show more of the shape.
     later = views[min(_RETRY_INTERVAL, len(views) - 1)].index
     return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0), None
+
+
+def restart_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
+    """The state before the next frame, its map begun again if that has explained the last frames badly for long.
+
+    It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
+    """
+    if state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
+        return state
+    state = replace(state, misfits=0, restarts=state.restarts + 1)
+    weights = FitWeights(smoothness=config.smoothness)
+    object_map = begin_again(state.object_map, state.camera, weights)
+    if object_map is state.object_map:
+        return state
+    last = object_map.keyframes[-1]
+    return replace(
+        state,
+        object_map=object_map,
+        surface=object_map.surface(),
+        last_pose=(last.pose, last.index),
+        previous_pose=None,
+        trajectory=((last.pose, last.index),),
+        baseline=LossBaseline(),
+        lost_frames=0,
+        doubtful_frames=0,
+        last_candidate=None,
+        motion_references=(),
+    )
 
 
 def _set_aside(state: SolverState, first: int) -> SolverState:

@@ -152,6 +152,18 @@ def loss_excess(fit: PoseFit, baseline: LossBaseline, mask_weight: float) -> flo
     return max(appearance, outline, overlap)
 
 
+def is_misfit(fit: PoseFit, baseline: LossBaseline) -> bool:
+    """Whether a map that explained its first `SETTLED` frames explains a later one worse, as a wrong shape does.
+
+    A surface without points adapts to what contradicts it, and the running means with it.
+    """
+    if baseline.sound is None:
+        return False
+    appearance, _, overlap = baseline.sound
+    compared = (fit.appearance - _UNSEEN_CHARGE * fit.unseen) / max(1 - fit.unseen, 0.2)
+    return compared > 2 * appearance + 0.1 or fit.overlap < overlap - _OVERLAP_ROOM
+
+
 def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 

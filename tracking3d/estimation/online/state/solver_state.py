@@ -95,6 +95,8 @@ class SolverState:
         lost_frames: How many frames in a row the object has been lost; those without a mask, in which no hypothesis can
             be tried, count as one.
         doubtful_frames: How many frames in a row have been lost or of low confidence.
+        misfits: How many frames in a row a map without points has explained worse than its first ones.
+        restarts: How often it was begun again for that.
         last_candidate: The best pose of the last frame, if that had a mask and the pose was rejected.
         trajectory: Poses and indices of the last tracked frames, for the motion model.
         colours: Colours of object and background in tracked frames.
@@ -130,6 +132,8 @@ class SolverState:
     baseline: LossBaseline = field(default_factory=LossBaseline)
     lost_frames: int = 0
     doubtful_frames: int = 0
+    misfits: int = 0
+    restarts: int = 0
     last_candidate: Pose | None = None
     trajectory: tuple[tuple[Pose, int], ...] = ()
     colours: ColourModels | None = None
