@@ -85,7 +85,6 @@ class SolverState:
         grey: ``(H, W)`` the last frame.
         tracked_points: Points in the last frame.
         pending: The frames that wait for the first map, with their estimates so far; None once there is a map.
-        rested: Frames before those, in which the object did not turn yet; they get a pose from the first map too.
         feature_space: The projection of the encoder's features; None leaves them as they are.
         next_attempt: The motion at which the next initialization is tried.
         ambiguous_frames: How many frames the last initialization had if it was ambiguous; 0 if there was none.
@@ -111,6 +110,7 @@ class SolverState:
         mask_agreement: How far the initial masks of the keyframes agree with each other.
         extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
             explain, by frame index.
+        rested: Frames before the pending ones, in which the object did not turn yet; the first map gives them a pose.
         background: The initialization that is computed in another thread, if there is one; see
             `tracking3d.estimation.online.map_initialization`.
     """
@@ -123,7 +123,6 @@ class SolverState:
     grey: NDArray[np.uint8]
     tracked_points: FollowedPoints
     pending: tuple[tuple[Keyframe, FrameEstimate], ...] | None = ()
-    rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     feature_space: FeatureSpace | None = None
     next_attempt: float = 0.0
     ambiguous_frames: int = 0
@@ -146,6 +145,7 @@ class SolverState:
     reversal_attempt: tuple[int, float] = (0, 0.0)
     mask_agreement: MaskAgreement = MaskAgreement()
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
