@@ -17,6 +17,7 @@ from tracking3d.estimation.online.state.confidence import (
     PoseEvidence,
     _doubt,
     assess_pose,
+    is_misfit,
     likelihood,
     loss_excess,
     needs_relocalization,
@@ -68,6 +69,21 @@ def test_what_is_usual_may_become_better():
     assert (baseline.appearance, baseline.outline, baseline.overlap) == pytest.approx(
         (0.05, 0.02, 0.99), abs=1e-3
     )
+
+
+def test_a_misfit_is_worse_than_the_first_frames_not_than_the_last_ones():
+    baseline = LossBaseline()
+    for _ in range(SETTLED):
+        assert not is_misfit(fit(appearance=2.0, overlap=0.1), baseline)
+        baseline = baseline.update(fit(appearance=0.1, overlap=0.95))
+    appearance, _, overlap = baseline.sound
+    for _ in range(50):
+        baseline = baseline.update(fit(appearance=0.5, overlap=0.85))
+    assert not is_misfit(fit(appearance=2 * appearance, overlap=overlap - 0.04), baseline)
+    assert is_misfit(fit(appearance=2 * appearance + 0.15, overlap=overlap), baseline)
+    assert is_misfit(fit(appearance=0.1, overlap=overlap - 0.06), baseline)
+    unseen = fit(appearance=0.1 + 0.5 * PoseWeights().unseen, unseen=0.5)
+    assert not is_misfit(replace(unseen, overlap=overlap), baseline)
 
 
 def test_excess_is_the_largest_of_pixels_outline_and_overlap():
