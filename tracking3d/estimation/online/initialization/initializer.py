@@ -226,7 +226,8 @@ def restart_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
 
     It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
     """
-    if state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
+    known = state.object_map.fixed_keyframes > 0
+    if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
         return state
     state = replace(state, misfits=0, restarts=state.restarts + 1)
     weights = FitWeights(smoothness=config.smoothness)
