@@ -15,6 +15,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 TURNS = (20.0, 50.0)
 """Degrees of rotation from the first view to the last."""
+_LATE_TURN = 40.0  # degrees in the second half of the views alone: a hand takes a thing before it turns it (chosen)
 DIRECTIONS = 8
 _VARIED_EXTENTS = (0.6, 1.6)  # times the rotation (chosen)
 _VARIED_AXES = (-22.0, 22.0)  # degrees in the image plane, half of what lies between two directions
@@ -22,7 +23,7 @@ _VARIED_SPIN = (-0.5, 0.5)  # rotation about the line of sight, as a share of th
 
 
 def rotation_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str, list[Pose]]]:
-    """Poses of the views for no rotation, and for turning steadily in eight directions, by two angles; with names.
+    """Poses of the views for no rotation, and for turning in eight directions, steadily by two angles or late; with names.
 
     Translations follow the masks' centres and sizes.
     """
@@ -33,10 +34,11 @@ def rotation_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str
     for direction in range(DIRECTIONS):
         angle = 2 * math.pi * direction / DIRECTIONS
         axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
-        for turn in TURNS:
-            degrees = [turn * (view.index - views[0].index) / frames for view in views]
+        parts = np.array([view.index - views[0].index for view in views]) / frames
+        late = np.clip(2 * parts - 1, 0, 1)
+        for degrees in (*(turn * parts for turn in TURNS), _LATE_TURN * late):
             poses = [
-                from_matrix(rotation_about(axis, part) @ first.R, translation)
+                from_matrix(rotation_about(axis, float(part)) @ first.R, translation)
                 for part, translation in zip(degrees, placed, strict=True)
             ]
             found.append((f"rotation {round(math.degrees(angle))}", poses))
