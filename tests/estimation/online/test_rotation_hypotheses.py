@@ -12,7 +12,8 @@ from tracking3d.estimation.online.initialization import initial_map
 from tracking3d.estimation.online.initialization.initial_map import begin_again, initialize_without_points
 from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
-    TURNS,
+    PROFILES,
+    TURN,
     reverse_rotations,
     rotation_hypotheses,
     vary_rotations,
@@ -28,19 +29,19 @@ def box_mask(left: int, top: int, side: int) -> np.ndarray:
     return mask
 
 
-def test_hypotheses_turn_steadily_in_every_direction_and_one_does_not() -> None:
+def test_hypotheses_turn_all_the_time_late_or_early_in_every_direction_and_one_does_not() -> None:
     views = list(turned_map([0.0, 0.0, 0.0]).keyframes)
     found = rotation_hypotheses(views, CAMERA)
-    assert len(found) == 1 + DIRECTIONS * len(TURNS)
+    assert len(found) == 1 + DIRECTIONS * len(PROFILES)
     assert len({name for name, _ in found}) == 1 + DIRECTIONS
-    angles = []
-    for _, poses in found:
+    halves = []
+    for _, poses in found[1:]:
         assert degrees_apart(poses[0], views[0].pose) == pytest.approx(0.0, abs=0.1)
-        half, whole = (degrees_apart(pose, views[0].pose) for pose in poses[1:])
-        assert half == pytest.approx(whole / 2, abs=0.1)
-        angles.append(whole)
-    assert sorted(angles)[0] == pytest.approx(0.0, abs=0.1)
-    assert sorted(angles)[1:] == pytest.approx(sorted(TURNS * DIRECTIONS), abs=0.1)
+        assert degrees_apart(poses[2], views[0].pose) == pytest.approx(TURN, abs=0.1)
+        halves.append(degrees_apart(poses[1], views[0].pose))
+    wanted = [TURN / 2, 0.0, TURN] * DIRECTIONS
+    assert halves == pytest.approx(wanted, abs=0.1)
+    assert degrees_apart(found[0][1][2], views[0].pose) == pytest.approx(0.0, abs=0.1)
 
 
 def test_translations_follow_the_masks() -> None:
