@@ -104,7 +104,7 @@ def test_a_rotation_between_the_directions_that_are_tried_is_found() -> None:
     # What the fit is asked for: a turn about none of the eight axes.
     wanted = [views[0].pose] + [
         from_matrix(rotation_about(torch.tensor([1.0, 0.4, 0.0]), angle) @ roll, views[0].pose.translation)
-        for angle in (5.0, 10.0, 15.0, 20.0)
+        for angle in (8.75, 17.5, 26.25, 35.0)
     ]
 
     def off(object_map: ObjectMap) -> float:

@@ -16,7 +16,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 TURN = 35.0
 """Degrees of rotation from the first view to the last, in eight directions. Varied, they are 21 to 56 (measured)."""
 PROFILES = ((0.0, 1.0), (0.5, 1.0), (0.0, 0.5))
-"""Parts of the time in which the object turns: a hand takes a thing before it turns it, or holds it still afterwards."""
+"""Parts of the time in which the object turns: a hand takes a thing before it turns it, or then holds it still."""
 DIRECTIONS = 8
 _VARIED_EXTENTS = (0.6, 1.6)  # times the rotation (chosen)
 _VARIED_AXES = (-22.0, 22.0)  # degrees in the image plane, half of what lies between two directions
