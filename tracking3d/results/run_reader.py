@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -57,18 +57,21 @@ class RunReader:
     """A run folder as it was when each part was first read.
 
     Args:
-        folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
-        one; else all are causal.
+        folder: The run folder.
+        refined: Whether frames, masks and mesh are those of the final refinement, if there is one; else all are causal.
+        whole: Whether a run is refused whose scaling was interrupted, so that its files are of two units.
 
     Raises:
-        InputError: If it is not a run folder.
+        InputError: If it is not a run folder, or not whole.
         FormatError: If it was written by an earlier or a later version.
     """
 
-    def __init__(self, folder: Path, refined: bool = True) -> None:
+    def __init__(self, folder: Path, refined: bool = True, whole: bool = True) -> None:
         self.folder = Path(folder)
         self.refined = refined
         self.description = _read_description(self.folder)
+        if whole:
+            _check_whole(self.folder, self.description)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -248,6 +251,14 @@ def is_finished(folder: Path) -> bool:
         InputError: If its ``run.json`` cannot be read.
     """
     return (folder / layout.RUN).is_file() and RunReader(folder).state == "finished"
+
+
+def _check_whole(folder: Path, description: Mapping[str, Any]) -> None:
+    if description.get("scaling"):
+        raise InputError(
+            f"Only some files of {folder} are in metres, since that was interrupted; resume the run, or give "
+            "`tracking3d model` its --object-size, which completes it."
+        )
 
 
 def read_records(path: Path, end: int | None = None) -> Iterator[FrameRecord]:
