@@ -19,7 +19,7 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
 from tracking3d.results.files import writing
 from tracking3d.results.lock import is_locked, try_lock
-from tracking3d.results.run_reader import RunReader, is_finished
+from tracking3d.results.run_reader import RunReader, is_finished, replacement_has_begun
 from tracking3d.results.run_unit import complete_scaling
 
 _log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ def take_over(folder: Path) -> None:
     stage = folder / layout.CORRECTING
     try:
         complete_scaling(folder)
-        begun = not (stage / layout.FRAMES).is_file()
+        begun = replacement_has_begun(folder)
         if not is_finished(stage) or is_locked(stage / layout.FRAMES):
             return
         if not begun and keeps_shape(folder) and "shape" not in RunReader(stage).description:

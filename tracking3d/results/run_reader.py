@@ -59,7 +59,8 @@ class RunReader:
     Args:
         folder: The run folder.
         refined: Whether frames, masks and mesh are those of the final refinement, if there is one; else all are causal.
-        whole: Whether a run is refused whose scaling was interrupted, so that its files are of two units.
+        whole: Whether a run is refused whose scaling, or the taking over of whose correction, was interrupted: its
+            files are of two units, or of two runs.
 
     Raises:
         InputError: If it is not a run folder, or not whole.
@@ -253,11 +254,26 @@ def is_finished(folder: Path) -> bool:
     return (folder / layout.RUN).is_file() and RunReader(folder).state == "finished"
 
 
+def replacement_has_begun(folder: Path) -> bool:
+    """Whether the corrected run is taking the place of a run: its lines do so first, its description last.
+
+    Raises:
+        InputError: If the description of the corrected run cannot be read.
+    """
+    stage = folder / layout.CORRECTING
+    return not (stage / layout.FRAMES).is_file() and is_finished(stage)
+
+
 def _check_whole(folder: Path, description: Mapping[str, Any]) -> None:
     if description.get("scaling"):
         raise InputError(
             f"Only some files of {folder} are in metres, since that was interrupted; resume the run, or give "
             "`tracking3d model` its --object-size, which completes it."
+        )
+    if replacement_has_begun(folder):
+        raise InputError(
+            f"Only some files of {folder} are those of its correction, since that was interrupted; repeat the "
+            "`tracking3d correct`, which completes it."
         )
 
 
