@@ -78,13 +78,19 @@ class Network:
             Every output by name.
 
         Raises:
-            InputError: The network does not accept these arrays.
+            InputError: The network does not accept these arrays, or answers with what is no number.
         """
         try:
             results = self._session.run(list(self.outputs), dict(feeds))
         except Exception as error:
             shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in feeds.items())
             raise InputError(f"{self.file} cannot be run on {shapes}: {_describe_error(error)}.") from error
+        for name, values in zip(self.outputs, results, strict=True):
+            if np.isnan(values).any():
+                raise InputError(
+                    f"The output '{name}' of {self.file} is not a number (NaN); correct how its description changes "
+                    "an image's values, or export the network again."
+                )
         return dict(zip(self.outputs, results, strict=True))
 
 
