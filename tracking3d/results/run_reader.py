@@ -296,7 +296,7 @@ def read_records(path: Path, end: int | None = None) -> Iterator[FrameRecord]:
             if end is not None and read > end:
                 return
             try:
-                yield FrameRecord.from_json(line)
+                yield FrameRecord.from_line(line, path)
             except ValueError as error:
                 # A kill cuts the last line off; what it leaves has a beginning and no end.
                 if line.startswith(b"{") and len(line) < LONGEST_LINE and not line.endswith(b"\n"):
