@@ -246,6 +246,20 @@ def test_a_network_that_finds_nothing_at_first_leaves_the_colours_in_the_box(fol
     assert ious([first], disc[1][:1])[0] > 0.8
 
 
+def test_the_ellipse_in_the_box_is_told_only_where_it_stands_for_the_object(
+    saliency, folder, tmp_path, caplog
+):
+    image = np.full((120, 160, 3), (60, 90, 150), np.uint8)
+    cv2.line(
+        image, (52, 42), (98, 78), (220, 90, 30), 2
+    )  # too thin for colours, and what the network looks for
+    blind = saliency_network(tmp_path / "blind.onnx", gain=0.0)
+    for model, said in ((saliency["model"], 0), (str(blind), 1)):
+        caplog.clear()
+        build({**saliency, "model": model}).init(Frame(0, image), Prompt((50.0, 40.0, 50.0, 40.0)))
+        assert len(caplog.records) == said
+
+
 def test_of_several_crops_the_mask_that_fits_the_colours_is_chosen(saliency, disc, monkeypatch):
     tracker = build(saliency)
     original = tracker._segmenter.propose
