@@ -22,6 +22,7 @@ from tracking3d.estimation.known_object import KnownObject
 from tracking3d.estimation.online.known_object.rendered_keyframes import SIDES, map_of_known_object
 from tracking3d.estimation.prototype_start import RADIUS
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.pipeline.known_object import load_known_object, read_known_object, select_camera
 from tracking3d.plugins import FEATURES, build_plugin
 from tracking3d.rendering import TexelMap
@@ -92,6 +93,28 @@ def test_a_face_of_a_vertex_far_beyond_the_last_is_refused(tmp_path, colour):
     (tmp_path / "thing.ply").write_text(text)
     with pytest.raises(InputError, match="give the folder of an earlier run, or a mesh file"):
         read_known_object(tmp_path / "thing.ply")
+
+
+def test_instances_of_a_part_are_read_without_a_copy_each(tmp_path, monkeypatch):
+    turn = [0, 0.6, 0, 0.8]
+
+    def place(tree):
+        tree["nodes"] = [
+            {"mesh": 0, "translation": [n, 0, 0], "rotation": turn, "scale": [(-1) ** n, 1, 2]}
+            for n in range(40)
+        ]
+        tree["scenes"], tree["scene"] = [{"nodes": list(range(40))}], 0
+
+    path = glb_of(tmp_path, place)
+    expected = trimesh.load_scene(path, process=False).to_mesh()
+    copies, copy = [], trimesh.Trimesh.copy
+    monkeypatch.setattr(trimesh.Trimesh, "copy", lambda mesh, **how: copies.append(mesh) or copy(mesh, **how))
+    mesh = read_mesh_file(path)
+    assert len(copies) < 5
+    assert mesh.area == pytest.approx(expected.area) and mesh.volume == pytest.approx(expected.volume)
+    order, other = (np.lexsort(one.vertices.round(6).T) for one in (mesh, expected))
+    np.testing.assert_allclose(mesh.vertices[order], expected.vertices[other], atol=1e-6)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[order], expected.visual.vertex_colors[other])
 
 
 def test_the_solver_s_unit_is_left_again_as_it_was_entered():
