@@ -14,12 +14,13 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import anyio
 from fastapi import FastAPI, HTTPException, Query, Request
 from starlette.concurrency import run_in_threadpool
 
@@ -35,6 +36,7 @@ class Limits:
     """What one request may take."""
 
     video_bytes: int = 200_000_000
+    upload_seconds: float = 60
     frames: int = 600
     pixels: int = 1920 * 1080
     seconds: float = 300
@@ -47,7 +49,7 @@ CONTAINERS = {b"ftyp": 4, b"\x1a\x45\xdf\xa3": 0, b"AVI ": 8}
 def service(limits: Limits = Limits()) -> FastAPI:
     """The application."""
     app = FastAPI(title="tracking3d", version=tracking3d.__version__)
-    one_at_a_time = threading.Semaphore(1)
+    one_at_a_time, uploads = threading.Semaphore(1), threading.Semaphore(4)
 
     @app.get("/health")
     def health() -> dict[str, str]:
@@ -60,28 +62,39 @@ def service(limits: Limits = Limits()) -> FastAPI:
         fov: Annotated[float | None, Query(gt=1, lt=170, description="vertical, degrees")] = None,
     ) -> dict[str, Any]:
         """Send the video as the body; its poses come back when all of it has been tracked."""
-        if not one_at_a_time.acquire(blocking=False):
-            raise HTTPException(503, "Another video is being tracked; try again.", {"Retry-After": "30"})
-        try:
-            with tempfile.TemporaryDirectory(prefix="tracking3d-") as folder:
-                video = Path(folder) / "video"
-                await receive(request, video, limits.video_bytes)
+        with tempfile.TemporaryDirectory(prefix="tracking3d-") as folder:
+            video = Path(folder) / "video"
+            with place_in(uploads, "Other videos are being sent; try again."):
+                await receive(request, video, limits)
+            with place_in(one_at_a_time, "Another video is being tracked; try again."):
                 return await run_in_threadpool(answer, video, box, fov, limits)
-        finally:
-            one_at_a_time.release()
 
     return app
 
 
-async def receive(request: Request, video: Path, most: int) -> None:
-    """Write the body of a request to a file, as far as it may go."""
-    count = 0
-    with video.open("wb") as file:
-        async for chunk in request.stream():
-            count += len(chunk)
-            if count > most:
-                raise HTTPException(413, f"The video has more than {most} bytes; send a shorter one.")
-            file.write(chunk)
+@contextmanager
+def place_in(places: threading.Semaphore, taken: str) -> Iterator[None]:
+    """Take one of the places, at once or not at all."""
+    if not places.acquire(blocking=False):
+        raise HTTPException(503, taken, {"Retry-After": "30"})
+    try:
+        yield
+    finally:
+        places.release()
+
+
+async def receive(request: Request, video: Path, limits: Limits) -> None:
+    """Write the body of a request to a file, as far as it may go, and as long as it may take."""
+    count, most = 0, limits.video_bytes
+    try:
+        with video.open("wb") as file, anyio.fail_after(limits.upload_seconds):
+            async for chunk in request.stream():
+                count += len(chunk)
+                if count > most:
+                    raise HTTPException(413, f"The video has more than {most} bytes; send a shorter one.")
+                file.write(chunk)
+    except TimeoutError as error:
+        raise HTTPException(408, f"The video did not come within {limits.upload_seconds:g} s.") from error
     with video.open("rb") as file:
         head = file.read(16)
     if not any(head[start : start + len(mark)] == mark for mark, start in CONTAINERS.items()):

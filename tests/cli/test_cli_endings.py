@@ -32,6 +32,18 @@ def test_a_full_device_is_told():
     assert line.startswith("error: the output cannot be written (No space left on device)")
 
 
+def test_a_folder_that_was_deleted_is_told(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    script = f"rmdir {gone} && exec {sys.executable} -m tracking3d run {tmp_path} --box 1,2,3,4 --out {tmp_path}/run"
+    path = {**os.environ, "PYTHONPATH": str(Path(program.__file__).parents[2])}
+    done = subprocess.run(
+        ["sh", "-c", script], cwd=gone, env=path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == "error: The current folder has been deleted; change to one that exists.\n"
+
+
 def test_a_closed_pipe_ends_in_silence():
     reader, writer = os.pipe()
     os.close(reader)

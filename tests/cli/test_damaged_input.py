@@ -21,7 +21,9 @@ from tracking3d.datasets.clip import write_clip
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.rigid import is_rigid
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
+from tracking3d.results.run_reader import RunReader
 from tracking3d.viewer.followed_run import FollowedRun
 
 LONG = "x" * 300
@@ -88,6 +90,22 @@ def test_poses_of_zeros_in_the_viewer(run):
     change_poses(run, ZEROS)
     with pytest.raises(InputError, match=r"frames\.jsonl is damaged \(the pose of frame 0 is not a rotation"):
         FollowedRun(run, "run").look_again()
+
+
+@pytest.mark.parametrize(
+    "command", [("export", "run", "--to", "tum"), ("report", "run"), ("points", "run", "--xy", "40,30")]
+)
+def test_a_pose_that_is_no_rotation_is_named_by_every_command(call, run, command):
+    change_poses(run, np.diag([1.0, 1, 1.05, 1]).tolist())
+    result = call(*command)
+    assert result.exit_code == 2 and "the pose of frame 0 is not a rotation" in result.stderr
+
+
+def test_poses_that_are_nearly_rotations_are_used_with_one_note(run, caplog):
+    change_poses(run, np.diag([1.0, 1, 1.005, 1]).tolist())
+    for _ in range(2):
+        assert all(is_rigid(record.T_cam_obj, 1e-9) for record in RunReader(run).frames)
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(

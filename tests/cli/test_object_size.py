@@ -93,7 +93,7 @@ def test_an_export_of_a_metric_run_is_metric_without_the_option(call, clip, scri
 @pytest.mark.parametrize(
     "command", [("run", "clip", *BOX), ("model", "run"), ("points", "run"), ("export", "run", "--to", "glb")]
 )
-@pytest.mark.parametrize("size", ["0", "-1", "nan", "inf"])
+@pytest.mark.parametrize("size", ["0", "-1", "nan", "inf", "1e+07"])
 def test_what_is_no_size_is_refused_before_anything_is_read(refused, command, size):
     assert f"--object-size is {size}; give a number of metres above 0" in refused(
         *command, "--object-size", size

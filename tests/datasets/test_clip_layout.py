@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.datasets.clip import is_rigid, read_truth
+from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError, OutputError
 from tracking3d.evaluation.metrics import mask_iou
+from tracking3d.geometry.rigid import is_rigid
 from tracking3d.results.files import read_mask, write_mask
 from tracking3d.synthesis.convex_clips import SyntheticSpec, make_demo_clip, synthesize
 from tracking3d.video import read_image
@@ -150,6 +151,23 @@ def test_only_finite_rotations_with_a_translation_are_rigid():
     assert is_rigid(np.eye(4))
     for wrong in (np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan), np.diag([1.0, 1, -1, 1])):
         assert not is_rigid(wrong)
+
+
+@pytest.mark.parametrize(
+    ("off", "message"), [(0.0027, ""), (0.018, ""), (0.03, "frame 000002 is not a rotation")]
+)
+def test_a_pose_that_is_nearly_a_rotation_is_replaced_by_the_nearest_one(clip, caplog, off, message):
+    sheared = np.eye(3)
+    sheared[0, 1] = off
+    edit_poses(clip, lambda frames: frames["000002"].update(R=sheared.tolist()))
+    if message:
+        with pytest.raises(InputError, match=message):
+            read_truth(clip)
+        return
+    for _ in range(2):
+        T = read_truth(clip).T_cam_obj[2]
+    assert is_rigid(T, 1e-12) and np.abs(T[:3, :3] - sheared).max() < off
+    assert [record.message.endswith("the nearest ones are used.") for record in caplog.records] == [True]
 
 
 def edit(file, **changes):

@@ -169,10 +169,10 @@ def test_the_images_of_the_frames_can_be_told(truth, tmp_path):
     poses_agree(answers_from_bop_csv(file, truth, im_ids=[20, 30, 40, 50]).T_cam_obj, {2: pose(2)})
 
 
-def test_a_pose_that_is_not_rigid_is_answered_but_no_pose(truth, tmp_path):
-    file = write_bop(tmp_path, bop_row(0, T=2 * pose(0)), bop_row(1))
-    answers = answers_from_bop_csv(file, truth)
-    assert list(answers.T_cam_obj) == [1] and answers.answered == {0, 1}
+def test_a_pose_that_is_not_rigid_is_refused_with_its_line_and_image(truth, tmp_path):
+    file = write_bop(tmp_path, bop_row(1), bop_row(0, T=2 * pose(0)))
+    with pytest.raises(InputError, match=r"Line 3 of .*\(image 0\): R is not a rotation"):
+        answers_from_bop_csv(file, truth)
 
 
 @pytest.mark.parametrize(

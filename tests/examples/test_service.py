@@ -70,18 +70,15 @@ class Client:
         self._app = app
 
     def get(self, url: str) -> httpx.Response:
-        return self._ask("GET", url)
+        return anyio.run(self.ask, "GET", url, None)
 
-    def post(self, url: str, content: bytes) -> httpx.Response:
-        return self._ask("POST", url, content=content)
+    def post(self, url: str, content: Any) -> httpx.Response:
+        return anyio.run(self.ask, "POST", url, content)
 
-    def _ask(self, method: str, url: str, **given: Any) -> httpx.Response:
-        async def ask() -> httpx.Response:
-            transport = httpx.ASGITransport(app=self._app)
-            async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
-                return await client.request(method, url, **given)
-
-        return anyio.run(ask)
+    async def ask(self, method: str, url: str, content: Any) -> httpx.Response:
+        transport = httpx.ASGITransport(app=self._app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return await client.request(method, url, content=content)
 
 
 def client(**limits: Any) -> Client:
@@ -140,6 +137,21 @@ def test_a_container_with_nothing_in_it_is_told_without_our_paths(video):
 def test_a_box_or_lens_that_is_none_is_told(video, query):
     answer = client().post(f"/track{query}", content=video)
     assert (answer.status_code, bool(answer.json()["detail"])) == (422, True)
+
+
+def test_an_upload_that_drips_is_ended_and_takes_no_place_meanwhile(video, at_once):
+    one, seen = client(upload_seconds=1.0), []
+
+    async def drops():
+        yield video[:16]
+        seen.append((await one.ask("POST", URL, content=video)).status_code)
+        while True:
+            await anyio.sleep(0.1)
+            yield b"x"
+
+    dripping = one.post(URL, content=drops())
+    assert (dripping.status_code, seen) == (408, [200])
+    assert one.post(URL, content=video).status_code == 200
 
 
 def test_one_at_a_time(video, at_once, monkeypatch):

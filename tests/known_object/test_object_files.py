@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +19,12 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.known_object import KnownObject
+from tracking3d.estimation.online.known_object.rendered_keyframes import SIDES, map_of_known_object
 from tracking3d.estimation.prototype_start import RADIUS
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.pipeline.known_object import load_known_object, read_known_object, select_camera
+from tracking3d.plugins import FEATURES, build_plugin
 from tracking3d.rendering import TexelMap
 from tracking3d.rendering.face_atlas import face_atlas, on_faces, paint_faces, shares_no_texel
 
@@ -45,6 +50,71 @@ def run_folder(folder, status=Status.TRACKED, camera=None, model=True):
         )
         writer.finish(sphere() if model else None, "finished")
     return folder
+
+
+def glb_of(folder, change) -> Path:
+    """A coloured box as GLB, whose glTF tree is changed."""
+    data = coloured_box().export(file_type="glb")
+    length = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + length])
+    change(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = struct.pack("<I4s", len(text), b"JSON") + text + data[20 + length :]
+    (folder / "thing.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(rest)) + rest)
+    return folder / "thing.glb"
+
+
+def test_a_flat_thing_is_known_by_the_sides_that_show_it(tmp_path):
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+    known, config = read_known_object(tmp_path / "flat.obj"), load_config()
+    learnt, _ = map_of_known_object(
+        known, config, build_plugin(FEATURES, config.features), torch.device("cpu")
+    )
+    assert learnt.fixed_keyframes == len(learnt.keyframes) == SIDES / 2  # it is seen from in front only
+
+
+def test_positions_of_two_numbers_are_refused(tmp_path):
+    def flatten(tree):
+        place = tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+        tree["accessors"][place]["type"] = "VEC2"
+
+    with pytest.raises(InputError, match="has positions that are not three numbers each"):
+        read_known_object(glb_of(tmp_path, flatten))
+
+
+@pytest.mark.parametrize("colour", ["", " 1 2 3"])
+def test_a_face_of_a_vertex_far_beyond_the_last_is_refused(tmp_path, colour):
+    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) if colour else ""
+    axes = "".join(f"property float {name}\n" for name in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{axes}{names}element face 1\n"
+    points = "".join(f"{point}{colour}\n" for point in ("0 0 0", "1 0 0", "0 1 1"))
+    text = f"{head}property list uchar int vertex_indices\nend_header\n{points}3 0 1 2000000000\n"
+    (tmp_path / "thing.ply").write_text(text)
+    with pytest.raises(InputError, match="give the folder of an earlier run, or a mesh file"):
+        read_known_object(tmp_path / "thing.ply")
+
+
+def test_instances_of_a_part_are_read_without_a_copy_each(tmp_path, monkeypatch):
+    turn = [0, 0.6, 0, 0.8]
+
+    def place(tree):
+        tree["nodes"] = [
+            {"mesh": 0, "translation": [n, 0, 0], "rotation": turn, "scale": [(-1) ** n, 1, 2]}
+            for n in range(40)
+        ]
+        tree["scenes"], tree["scene"] = [{"nodes": list(range(40))}], 0
+
+    path = glb_of(tmp_path, place)
+    expected = trimesh.load_scene(path, process=False).to_mesh()
+    copies, copy = [], trimesh.Trimesh.copy
+    monkeypatch.setattr(trimesh.Trimesh, "copy", lambda mesh, **how: copies.append(mesh) or copy(mesh, **how))
+    mesh = read_mesh_file(path)
+    assert len(copies) < 5
+    assert mesh.area == pytest.approx(expected.area) and mesh.volume == pytest.approx(expected.volume)
+    order, other = (np.lexsort(one.vertices.round(6).T) for one in (mesh, expected))
+    np.testing.assert_allclose(mesh.vertices[order], expected.vertices[other], atol=1e-6)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[order], expected.visual.vertex_colors[other])
 
 
 def test_the_solver_s_unit_is_left_again_as_it_was_entered():

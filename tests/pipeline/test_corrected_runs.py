@@ -222,6 +222,9 @@ def test_a_kill_while_the_copy_takes_its_place_is_made_good(clip, images, tmp_pa
         patch.setattr(Path, "replace", killed)
         with pytest.raises(Stopped):
             correct_run(tmp_path / "run", told(clip))
+    if moves:
+        with pytest.raises(InputError, match=r"Only some files of .* are those of its correction"):
+            RunReader(tmp_path / "run")
     staging.take_over(tmp_path / "run")
     assert (tmp_path / "run" / "my_notes.txt").read_text() == "mine"
     (tmp_path / "run" / "my_notes.txt").unlink()

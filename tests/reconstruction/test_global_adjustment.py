@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.points import landmark_adjustment
 from tracking3d.points.track_chaining import Chain
 from tracking3d.reconstruction import global_adjustment
@@ -113,6 +114,19 @@ def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_s
     assert abs(np.log(look.camera.fx / CAMERA.fx)) < 2 * look.camera.focal_deviation < 0.3
     assert look.camera.origin == f"solved field of view of {look.camera.fov:.1f} degrees"
     assert rotation_errors(found).mean() < 0.5
+
+
+def test_a_lens_that_a_few_views_from_one_side_do_not_tell_stays_as_it_was_assumed():
+    longer = replace(CAMERA, fx=1.3 * CAMERA.fx, fy=1.3 * CAMERA.fy, assumed=True)
+    true = np.stack([pose(yaw, 0.0) for yaw in (0.0, 3.0, 6.0, 9.0)])
+    off = true.copy()
+    off[:, 2, 3] *= 1.3
+    look = GlobalAdjustment(ball(), longer, range(4), 20)
+    for index, T in enumerate(true):
+        look.see(answer(index, off[index]), *seen(T, pattern()))
+    look.settle()
+    assert look.camera.focal_deviation > LENS_KNOWN
+    assert look.camera == replace(longer, focal_deviation=look.camera.focal_deviation)
 
 
 def test_a_lost_frame_is_not_looked_at_but_goes_on_from_the_view_before_to_the_one_after():
@@ -234,14 +248,14 @@ def test_few_views_are_bundled_and_all_of_them_only_where_those_share_too_few_la
     monkeypatch, supported
 ):
     bundled = []
-    refine_scene = global_adjustment.refine_scene
+    refine_through = global_adjustment.refine_through
 
-    def refine(scene, rounds, **given):
+    def refine(scene, rounds, camera):
         bundled.append(len(scene.views))
-        return refine_scene(scene, rounds, **given)
+        return refine_through(scene, rounds, camera)
 
     monkeypatch.setattr(global_adjustment, "_USUAL_VIEWS", 5)
-    monkeypatch.setattr(global_adjustment, "refine_scene", refine)
+    monkeypatch.setattr(global_adjustment, "refine_through", refine)
     if not supported:
         monkeypatch.setattr(global_adjustment, "is_supported", lambda scene: len(scene.views) > 5)
     _, found = settled(disturbed())

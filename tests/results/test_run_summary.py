@@ -115,11 +115,19 @@ SOLVED = {"assumed": True, "origin": "solved field of view of 17.8 degrees"}
 
 
 def test_an_estimated_lens_is_a_doubt_if_its_uncertainty_says_so():
-    assert describe_camera_and_model(SOLVED | {"focal_deviation": 0.21}, None) == [
-        "no focal length was given: solved field of view of 17.8 degrees, uncertain by 21 % of the focal length; "
+    assert describe_camera_and_model(SOLVED | {"focal_deviation": 0.08}, None) == [
+        "no focal length was given: solved field of view of 17.8 degrees, uncertain by 8 % of the focal length; "
         "give --fov or --intrinsics if depth matters"
     ]
     assert describe_camera_and_model(SOLVED | {"focal_deviation": 0.01}, None) == []
+
+
+def test_a_lens_that_the_video_does_not_tell_is_not_known():
+    assumed = {"assumed": True, "origin": "default field of view", "focal_deviation": 0.21}
+    [note] = describe_camera_and_model(assumed, None)
+    assert note.startswith(
+        "no focal length was given: default field of view, and the video does not tell it; give"
+    )
 
 
 @pytest.mark.parametrize("unknown", [{}, {"focal_deviation": None}], ids=["earlier version", "not estimated"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from turning_sphere import started_run, written_run
 
 from tracking3d.config.models import ObjectConfig
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout, run_unit
 from tracking3d.results.correspondences import track_points
 from tracking3d.results.mesh_export import export_mesh, load_model
@@ -117,7 +118,25 @@ def test_a_second_size_counts_and_the_first_leaves_no_trace(run, tmp_path, turni
     np.testing.assert_allclose(load_model(run).vertices, load_model(tmp_path / "once").vertices, rtol=1e-12)
 
 
-@pytest.mark.parametrize("killed_at", range(4))
+def test_on_a_full_disk_a_run_stays_whole_in_its_own_unit(run, monkeypatch):
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    write = Path.write_bytes
+
+    def until_the_mesh(self, data):
+        if layout.GLB in self.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", until_the_mesh)
+        with pytest.raises(OutputError, match="disk is full"):
+            scale_run(run, METRES)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    scale_run(run, METRES)
+    assert visible_side(load_model(run)) == pytest.approx(METRES)
+
+
+@pytest.mark.parametrize("killed_at", [0, 1, 2, 5, 9, 12])
 def test_a_scaling_that_was_killed_is_completed(refined_run, tmp_path, monkeypatch, killed_at):
     class Killed(BaseException):
         pass
@@ -133,10 +152,13 @@ def test_a_scaling_that_was_killed_is_completed(refined_run, tmp_path, monkeypat
         return call
 
     with monkeypatch.context() as patch:
-        for name in ("_write_lines", "export_mesh", "note_in_run"):
-            patch.setattr(run_unit, name, until_then(getattr(run_unit, name)))
+        patch.setattr(run_unit, "note_in_run", until_then(run_unit.note_in_run))
+        patch.setattr(Path, "replace", until_then(Path.replace))
         with pytest.raises(Killed):
             scale_run(refined_run, METRES)
+    if json.loads((refined_run / layout.RUN).read_bytes()).get("scaling"):
+        with pytest.raises(InputError, match=r"Only some files of .* are in metres"):
+            RunReader(refined_run)
     apply_object_size(refined_run, ObjectConfig(size=METRES))
     reader = RunReader(refined_run)
     assert reader.unit == "metre" and not reader.description["scaling"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.rigid import is_rigid
 from tracking3d.synthesis.motions import make_path
 from tracking3d.synthesis.pick_up import PICK_UP
 from tracking3d.synthesis.spec import Motion, SequenceSpec

@@ -128,6 +128,14 @@ def test_a_stream_that_is_lost_is_asked_for_again_a_few_times(tmp_path, serve, c
     assert handler.connections == 3 + stream.TRIES
 
 
+def test_a_stream_that_ends_again_and_again_has_ended(tmp_path, serve, caplog):
+    handler = type("Handler", (Live,), {"data": of_transport_stream(tmp_path), "connections": 0, "most": 50})
+    items = list(open_source(f"http://{serve(handler)}/live"))
+    assert handler.connections == 2 + stream.TRIES  # the first one was to look
+    assert [item.index for item in items] == list(range(10 * (1 + stream.TRIES)))
+    assert "ended 4 times" in caplog.text
+
+
 def test_a_stream_gives_no_more_than_was_selected(tmp_path, serve):
     host = serve(type("Handler", (Live,), {"data": of_transport_stream(tmp_path), "connections": 0}))
     items = list(open_source(f"http://{host}/live", ":4"))

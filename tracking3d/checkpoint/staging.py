@@ -19,7 +19,8 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
 from tracking3d.results.files import writing
 from tracking3d.results.lock import is_locked, try_lock
-from tracking3d.results.run_reader import RunReader, is_finished
+from tracking3d.results.run_reader import RunReader, is_finished, replacement_has_begun
+from tracking3d.results.run_unit import complete_scaling
 
 _log = logging.getLogger(__name__)
 
@@ -88,14 +89,16 @@ def keeps_shape(folder: Path) -> bool:
 def take_over(folder: Path) -> None:
     """Replace a run by its corrected run, if that is finished, its model included.
 
-    What was exported of the run as it was is kept in `layout.EXPORT_BEFORE`.
+    What was exported of the run as it was is kept in `layout.EXPORT_BEFORE`. A scaling that was interrupted is
+    completed, too.
 
     Raises:
         OutputError: If a file cannot be moved.
     """
     stage = folder / layout.CORRECTING
-    begun = not (stage / layout.FRAMES).is_file()
     try:
+        complete_scaling(folder)
+        begun = replacement_has_begun(folder)
         if not is_finished(stage) or is_locked(stage / layout.FRAMES):
             return
         if not begun and keeps_shape(folder) and "shape" not in RunReader(stage).description:

@@ -68,6 +68,9 @@ def model(
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
+    from tracking3d.checkpoint.staging import take_over
+
+    take_over(run)
     from tracking3d.reconstruction.final_shape import texture_limits
     from tracking3d.report.renewal import renew_report
     from tracking3d.results.run_reader import RunReader

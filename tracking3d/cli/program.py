@@ -16,6 +16,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -38,6 +39,7 @@ class Program(TyperGroup):
         _print_anything()
         try:
             _refuse_empty(arguments)
+            _refuse_deleted_folder()
             code = super().main(arguments, *more, **{**extra, "standalone_mode": False})
             if sys.stdout is not None:  # None if it was closed before the program started
                 sys.stdout.flush()
@@ -174,6 +176,18 @@ def _refuse_empty(arguments: Sequence[str]) -> None:
         if value == "" or re.fullmatch("--[a-z-]+=", value):
             name = value.rstrip("=") or (option if option.startswith("-") else "an argument")
             raise InputError(f"{name} is empty; give it a value or leave it out.")
+
+
+def _refuse_deleted_folder() -> None:
+    """Refuse to run where there is no folder any more; libraries of torch end the process there.
+
+    Raises:
+        InputError: The current folder was deleted.
+    """
+    try:
+        Path.cwd()
+    except FileNotFoundError as error:
+        raise InputError("The current folder has been deleted; change to one that exists.") from error
 
 
 def _print(line: str, error: BaseException) -> None:

@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tracking3d.config.section import Section
 from tracking3d.config.solvers import OnlineConfig, SolverConfig
 
+LARGEST_OBJECT = 1e6
+"""Metres that an object's longest side may have; chosen."""
 AUTO = "auto"
 """Name of the mask tracker that stands for the best one at hand, see `tracking3d.pipeline.tracker_selection`."""
 
@@ -172,7 +174,7 @@ class ObjectConfig(Section):
     size: float | None = Field(
         None,
         gt=0,
-        le=1e6,
+        le=LARGEST_OBJECT,
         description=(
             "Metres of the object's longest side: of the longest side of the smallest box around what the video has "
             "shown. All lengths of the finished run are then in metres; null leaves the run's arbitrary unit. A known "

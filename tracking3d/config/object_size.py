@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from tracking3d.config.explain import a_kind
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import LARGEST_OBJECT, PipelineConfig
 from tracking3d.errors import InputError, argument
 
 _SIZE = argument("object_size=", "--object-size")
@@ -22,8 +21,10 @@ def check_object_size(metres: Any) -> float | None:
         return None
     if isinstance(metres, bool) or not isinstance(metres, int | float):
         raise InputError(f"{_SIZE} is {a_kind(metres)}; give a number of metres above 0.")
-    if not 0 < metres < math.inf:
-        raise InputError(f"{_SIZE} is {metres:g}; give a number of metres above 0.")
+    if not 0 < metres <= LARGEST_OBJECT:
+        raise InputError(
+            f"{_SIZE} is {metres:g}; give a number of metres above 0 and not above {LARGEST_OBJECT:,.0f}."
+        )
     return float(metres)
 
 

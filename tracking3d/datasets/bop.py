@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.datasets.json_files import read_json
 from tracking3d.errors import InputError
+from tracking3d.geometry.rigid import is_rigid, nearest_rigid
 
 LARGEST_STEP = 0.01
 """``max_sym_disc_step``: how far, in diameters, a point of the object may move from one turn about an axis of
@@ -45,7 +45,7 @@ def read_scene_gt(file: Path) -> dict[int, list[Annotation]]:
         InputError: If it is not such a file, or a rotation is none.
     """
     return {
-        number: [_annotation(entry, n, f"{file}: image {number}") for n, entry in enumerate(entries)]
+        number: [_annotation(entry, n, file, number) for n, entry in enumerate(entries)]
         for number, entries in _by_number(file, list).items()
     }
 
@@ -119,7 +119,8 @@ def _turns(
     return turns
 
 
-def _annotation(entry: Any, instance: int, where: str) -> Annotation:
+def _annotation(entry: Any, instance: int, file: Path, image: int) -> Annotation:
+    where = f"{file}: image {image}"
     try:
         T = np.eye(4)
         T[:3, :3] = np.reshape(entry["cam_R_m2c"], (3, 3))
@@ -129,9 +130,9 @@ def _annotation(entry: Any, instance: int, where: str) -> Annotation:
         raise InputError(
             f"{where} needs obj_id, cam_R_m2c (9 numbers) and cam_t_m2c (3 numbers); correct that entry."
         ) from error
-    if not is_rigid(T):
+    if (rigid := nearest_rigid(T, file)) is None:
         raise InputError(f"{where}: cam_R_m2c of object {object_id} is not a rotation; correct it.")
-    return Annotation(object_id, instance, T)
+    return Annotation(object_id, instance, rigid)
 
 
 def _by_number(file: Path, kind: type) -> dict[int, Any]:

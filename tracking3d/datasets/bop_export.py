@@ -23,9 +23,9 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 from trimesh.exchange.ply import export_ply
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.datasets.truth import MeshFile, Truth
 from tracking3d.errors import InputError
+from tracking3d.geometry.rigid import is_rigid
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
 from tracking3d.video.image_file import read_image
 

@@ -35,6 +35,7 @@ from tracking3d.datasets.truth import DepthFile, MaskFile, MeshFile, PointTruth,
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.rigid import is_rigid, nearest_rigid
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
 from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.trackers.crops import box_of
@@ -140,10 +141,12 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
             ) from error
         if not trusted or name not in index:
             continue
-        if not is_rigid(T):
+        rigid = nearest_rigid(T, file)
+        if rigid is None:
             raise InputError(
                 f"{file}: R of frame {name} is not a rotation; correct it or mark it trusted: false."
             )
+        T = rigid
         if R is None:
             T[:3, :3] = np.nan
         if t is None:
@@ -197,14 +200,6 @@ def write_clip(
         write_mask(folder / "masks" / f"{name}.png", mask)
     for file, document in documents.items():
         write_atomic(folder / file, json.dumps(document, indent=1).encode() + b"\n")
-
-
-def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
-    """Whether ``T`` is a finite ``(4, 4)`` rigid transform."""
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0)
 
 
 def _images(folder: Path) -> list[Path]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError
+from tracking3d.geometry.rigid import nearest_rigid
 from tracking3d.trackers.vot_regions import parse_numbers
 
 
@@ -26,7 +26,7 @@ def read_matrices(files: Mapping[int, Path], *, inverse: bool = False) -> dict[i
     Raises:
         InputError: If a file is not of that kind.
     """
-    poses = {index: _pose(_text(file), inverse, str(file)) for index, file in files.items()}
+    poses = {index: _pose(_text(file), inverse, file) for index, file in files.items()}
     return {index: T for index, T in poses.items() if T is not None}
 
 
@@ -37,11 +37,12 @@ def read_matrix_lines(file: Path, *, inverse: bool = False) -> dict[int, NDArray
         InputError: If a line is damaged; names file and line.
     """
     lines = _text(file).rstrip().splitlines()
-    poses = {n: _pose(line, inverse, f"{file}, line {n + 1}") for n, line in enumerate(lines)}
+    poses = {n: _pose(line, inverse, file, f", line {n + 1}") for n, line in enumerate(lines)}
     return {index: T for index, T in poses.items() if T is not None}
 
 
-def _pose(text: str, inverse: bool, where: str) -> NDArray[np.float64] | None:
+def _pose(text: str, inverse: bool, file: Path, line: str = "") -> NDArray[np.float64] | None:
+    where = f"{file}{line}"
     try:
         numbers = np.array(parse_numbers(text))
         T = np.eye(4)
@@ -53,8 +54,9 @@ def _pose(text: str, inverse: bool, where: str) -> NDArray[np.float64] | None:
         raise InputError(f"{where} is not a pose of 3 x 4 or 4 x 4 numbers ({error}); correct it.") from error
     if np.isnan(numbers).all():
         return None
-    if not is_rigid(T) or not np.allclose(T[3], (0, 0, 0, 1)):
+    if not np.allclose(T[3], (0, 0, 0, 1)) or (rigid := nearest_rigid(T, file)) is None:
         raise InputError(f"{where}: the pose is not a rotation and a translation; correct it.")
+    T = rigid
     if inverse:
         T[:3, 3] = -T[:3, :3].T @ T[:3, 3]
         T[:3, :3] = T[:3, :3].T.copy()

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.datasets.answers import Answers
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.datasets.truth import MaskFile, MaskReference, Truth
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
@@ -67,7 +66,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
         masks={index: MaskFile(run.mask_path(one.index)) for index, one in records.items()},
         visible_masks=_masks_in(folder, layout.visible_mask_path, records) or None,
         initial_masks=_masks_in(folder, layout.initial_mask_path, records),
-        T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
+        T_cam_obj={index: one.T_cam_obj for index, one in records.items() if one.has_pose},
         lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
         confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
         seconds=seconds,
@@ -190,7 +189,7 @@ class _RunPoints:
         visible = np.zeros((self.frames, count), bool)
         own = frame - self.offset
         record = next((one for one in self.run.frames if one.index == own), None)
-        if record is None or record.status is Status.LOST or not is_rigid(record.T_cam_obj):
+        if record is None or record.status is Status.LOST or not record.has_pose:
             return positions, visible  # where the object was not found, its points were not either
         from tracking3d.results.correspondences import track_points
 

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.export.options import ExportOptions
@@ -124,7 +123,7 @@ class ExportedRun:
                 n, self.seconds(n), scale_pose(one.T_cam_obj, self.scale), self.reader.camera_of(one), one
             )
             for n, one in self.records.items()
-            if one.status is not Status.LOST and is_rigid(one.T_cam_obj)
+            if one.status is not Status.LOST and one.has_pose
         ]
         if not posed:
             raise InputError(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tracking3d.config.object_size import check_object_size
 from tracking3d.errors import InputError, OutputError, argument
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
@@ -146,10 +147,9 @@ def export_run(
 
 
 def _check(options: ExportOptions) -> None:
-    for name in ("object_size", "fps"):
-        value = getattr(options, name)
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"{_NAMED[name]} is {value:g}; give a number above 0.")
+    check_object_size(options.object_size)
+    if options.fps is not None and not 0 < options.fps < float("inf"):
+        raise InputError(f"{_NAMED['fps']} is {options.fps:g}; give a number above 0.")
     if options.start_time is not None and not 0 < options.start_time < _END_OF_TIME:
         raise InputError(
             f"{_NAMED['start_time']} is {options.start_time:g}; give seconds from 1970 above 0 and before 2038, "

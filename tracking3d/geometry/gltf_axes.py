@@ -8,9 +8,10 @@ that the mesh itself stays in object coordinates.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import trimesh
@@ -36,11 +37,41 @@ def read_mesh_file(path: Path) -> trimesh.Trimesh:
 
     scene = trimesh.load_scene(path, process=False)
     _share_texture(scene)
-    mesh = scene.to_mesh()
+    mesh: Any
+    places: dict[Any, list[NDArray[np.float64]]] = {}
+    for node in scene.graph.nodes_geometry:
+        T, name = scene.graph.get(node)
+        places.setdefault(name, []).append(T)
+    if len(scene.graph.nodes_geometry) > len(places):
+        parts = [_instances(scene.geometry[name], np.stack(there)) for name, there in places.items()]
+        mesh = trimesh.util.concatenate(parts)
+    else:
+        mesh = scene.to_mesh()
     if OBJECT_NODE in scene.graph.nodes:
         upright, _ = scene.graph.get(OBJECT_NODE)
         mesh.apply_transform(np.linalg.inv(upright))
     return mesh
+
+
+def _instances(part: Any, T: NDArray[np.float64]) -> trimesh.Trimesh:
+    """A part at several places ``(N, 4, 4)``; trimesh would copy all of it for each, which takes milliseconds."""
+    import trimesh  # slow to import
+
+    count, vertices, faces = len(T), np.asarray(part.vertices), np.asarray(part.faces)
+    mirrored = np.linalg.det(T[:, :3, :3]) < 0
+    wound = np.where(mirrored[:, None, None], faces[:, ::-1], faces)
+    made = trimesh.Trimesh(
+        (vertices @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(-1, 3),
+        (wound + len(vertices) * np.arange(count)[:, None, None]).reshape(-1, 3),
+        process=False,
+    )
+    look = part.visual
+    if look.kind == "texture":
+        made.visual = trimesh.visual.TextureVisuals(np.tile(look.uv, (count, 1)), look.material)
+    elif look.kind is not None:
+        name = f"{look.kind}_colors"
+        setattr(made.visual, name, np.tile(getattr(look, name), (count, 1)))
+    return made
 
 
 def _share_texture(scene: trimesh.Scene) -> None:

@@ -54,6 +54,8 @@ def what_is_wrong(mesh: object) -> str:
 
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         return "holds no triangles"
+    if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):
+        return "has positions that are not three numbers each"
     if not np.isfinite(mesh.vertices).all():
         return "has vertices that are not finite"
     farthest = float(np.abs(mesh.vertices).max())

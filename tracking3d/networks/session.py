@@ -5,7 +5,9 @@ Only the ONNX graph is read: no code of a model file is executed, and nothing is
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,13 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+
+LONGEST_RUN = 600.0
+"""Seconds after which a run is ended; chosen. The largest encoders take a minute an image on a slow processor."""
+
+
+class _Endless(Exception):
+    """A network was still running after `LONGEST_RUN`."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +87,45 @@ class Network:
             Every output by name.
 
         Raises:
-            InputError: The network does not accept these arrays.
+            InputError: The network does not accept these arrays, answers with what is no number, or does not end.
         """
         try:
-            results = self._session.run(list(self.outputs), dict(feeds))
+            results = self._run(dict(feeds))
+        except _Endless as error:
+            raise InputError(
+                f"{self.file} did not end within {LONGEST_RUN:g} s; give another network."
+            ) from error
         except Exception as error:
             shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in feeds.items())
             raise InputError(f"{self.file} cannot be run on {shapes}: {_describe_error(error)}.") from error
+        for name, values in zip(self.outputs, results, strict=True):
+            if np.isnan(values).any():
+                raise InputError(
+                    f"The output '{name}' of {self.file} is not a number (NaN); correct how its description changes "
+                    "an image's values, or export the network again."
+                )
         return dict(zip(self.outputs, results, strict=True))
+
+    def _run(self, feeds: dict[str, NDArray]) -> list[NDArray]:
+        """Run it in another thread: this one hears Ctrl-C and SIGTERM meanwhile, and ends the run then."""
+        options, outcome = onnxruntime.RunOptions(), Future[list[NDArray]]()
+
+        def run() -> None:
+            try:
+                outcome.set_result(self._session.run(list(self.outputs), feeds, options))
+            except Exception as error:
+                outcome.set_exception(error)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        try:
+            return outcome.result(LONGEST_RUN)
+        except BaseException as error:
+            running, options.terminate = not outcome.done(), True
+            thread.join()
+            if running and isinstance(error, TimeoutError):
+                raise _Endless from error
+            raise
 
 
 def _info(node: onnxruntime.NodeArg) -> TensorInfo:

@@ -127,6 +127,8 @@ def replaced_by_correction(folder: Path, report: bool = True) -> list[str]:
 def check_corrections(folder: Path, corrections: Iterable[Correction]) -> None:
     """Make sure that a run has the frames that are to be corrected, and that its model can be made again.
 
+    An earlier correction that is finished, and takes the run's place in part, takes it before.
+
     Args:
         folder: The run folder of one object.
         corrections: See `correct_run`.
@@ -134,6 +136,7 @@ def check_corrections(folder: Path, corrections: Iterable[Correction]) -> None:
     Raises:
         InputError: If it has not, or a package is missing for its model.
     """
+    take_over(folder)
     run = RunReader(folder)
     _check_frames(run, corrections)
     if keeps_shape(folder):

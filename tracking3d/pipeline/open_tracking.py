@@ -193,7 +193,7 @@ def _select_tracker(
     """The configuration with a tracker in place of ``auto``, and why it is that one; None if the user named it."""
     config, source = request.config, request.source
     if config.tracker.name == AUTO and earlier is not None and (earlier / RUN).is_file():
-        before = RunReader(earlier)
+        before = RunReader(earlier, whole=False)
         if why := before.description.get("tracker_choice"):
             tracker = PluginChoice.model_validate(before.config["tracker"])
             return config.model_copy(update={"tracker": tracker}), str(why)

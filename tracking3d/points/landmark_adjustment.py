@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import Reversal
+from tracking3d.geometry.camera import Camera
 from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.robust_bundle import bundle, other_way_round
@@ -122,6 +123,12 @@ class LandmarkScene:
         return replace(
             self, views=views, vertices=vertices, focal_factor=self.focal_factor * focal_factor, support={}
         )
+
+
+def refine_through(scene: LandmarkScene, rounds: int, camera: Camera) -> LandmarkScene:
+    """`refine_scene`, with the focal length if nobody gave it and what comes of it is a lens that a video can tell."""
+    refined = refine_scene(scene, rounds, free_focal=camera.assumed)
+    return refined if camera.may_have(refined.focal_factor) else refine_scene(scene, rounds)
 
 
 def refine_scene(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.bundle_adjustment.reversal import Reversal, reversal_of
+from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.points.view import Array
 
 TURNS = 12
@@ -113,9 +114,9 @@ def bundle(
 
     Args:
         points, intrinsics, T_cam_obj, measured, deviation, held: See `intersect`.
-        begun: What this made of the same, to go on from, now with another lens if that has proof: all focal lengths may
-            change by one factor. Errors along a track hang together, so that a whole track counts as much as one
-            independent measurement, and has to pay for how far the lens changes.
+        begun: What this made of the same, to go on from, now with another lens if the views tell one, see `LENS_KNOWN`,
+            and it has proof: all focal lengths may change by one factor. Errors along a track hang together, so that a
+            whole track counts as much as one independent measurement, and has to pay for how far the lens changes.
         turns: The most steps that are tried.
     """
     known = np.isfinite(deviation) & np.isfinite(measured).all(2)
@@ -150,7 +151,7 @@ def bundle(
         # The loss is half of minus twice the logarithm of the likelihood, in units of squared outliers.
         information = 0.5 * _OUTLIER**2 * found.focal_curvature / tracked
         deviation_of_lens = 1 / math.sqrt(information + _LENS**-2)
-        if not gain > (math.log(found.focal_factor) / _LENS) ** 2:
+        if deviation_of_lens > LENS_KNOWN or not gain > (math.log(found.focal_factor) / _LENS) ** 2:
             return replace(begun, focal_deviation=deviation_of_lens)
     T = T_cam_obj.copy()
     T[:, :3, :3], T[:, :3, 3] = found.R, found.t

@@ -25,7 +25,7 @@ from tracking3d.points.landmark_adjustment import (
     LandmarkSupport,
     fit_outlines,
     is_supported,
-    refine_scene,
+    refine_through,
 )
 from tracking3d.points.resection import resect
 from tracking3d.points.view import LANDMARK_WINDOW, SurfaceView, open_view
@@ -114,11 +114,8 @@ class GlobalAdjustment:
         self._bundled = [there[place] for place in at]
         views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
-        return refine_scene(
-            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
-            int(np.clip(_DRAWN // len(views), *ROUNDS)),
-            free_focal=self.camera.assumed,
-        )
+        scene = LandmarkScene(views, self.vertices, self.faces, may_reverse=True)
+        return refine_through(scene, int(np.clip(_DRAWN // len(views), *ROUNDS)), self.camera)
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.estimation.estimate import Status
 from tracking3d.results.description import stages_of
 from tracking3d.results.records import FrameRecord
@@ -35,7 +34,7 @@ def reliable_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
     """``(N, 4, 4)`` poses; NaN if the object was lost or the pose is invalid."""
     poses = np.full((len(records), 4, 4), np.nan)
     for number, record in enumerate(records):
-        if record.status is not Status.LOST and is_rigid(record.T_cam_obj):
+        if record.status is not Status.LOST and record.has_pose:
             poses[number] = record.T_cam_obj
     return poses
 

@@ -57,11 +57,12 @@ def write_atomic(path: Path, data: bytes) -> None:
     write_together({path: data})
 
 
-def write_together(files: Mapping[Path, bytes]) -> None:
+def write_together(files: Mapping[Path, bytes], when_whole: Callable[[], None] = lambda: None) -> None:
     """Write files that belong together under temporary names, and rename them when all are whole.
 
     Args:
         files: Contents by path.
+        when_whole: Is called before they are renamed.
 
     Raises:
         OutputError: If one cannot be written; nothing has been renamed then.
@@ -70,6 +71,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
         for path, data in files.items():
             with writing(path):
                 partial_path(path).write_bytes(data)
+        when_whole()
         for path in files:
             with writing(path):
                 partial_path(path).replace(path)

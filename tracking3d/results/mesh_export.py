@@ -12,7 +12,7 @@ texel at the two poles mixes with the opposite edge.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -23,7 +23,7 @@ from PIL import Image as PillowImage
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
-from tracking3d.results.files import image_file, write_atomic, write_together
+from tracking3d.results.files import first_problem, image_file, write_atomic, write_together
 from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 from tracking3d.results.unseen_surface import (
     find_seen_faces,
@@ -56,20 +56,21 @@ def export_mesh(folder: Path, model: ObjectModel, unit: str = ARBITRARY) -> None
     Raises:
         OutputError: If one cannot be written.
     """
-    texture = _Texture(model)
-    files = obj_files(model, f"object coordinates, OpenCV axes, unit: {unit}", texture)
-    try:
-        files[GLB] = glb_file(model, texture=texture, unit=unit)
-        files[FEATURES] = _features_file(model)
-    except Exception:
-        _write_files(folder, files)
-        raise
-    _write_files(folder, files)
-
-
-def _write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    files: dict[Path, bytes] = {}
+    problem = first_problem(lambda: files.update(mesh_files(folder, model, unit)))
     with interrupts_deferred():
-        write_together({folder / name: data for name, data in files.items()})
+        write_together(files)
+    if problem is not None:
+        raise problem
+
+
+def mesh_files(folder: Path, model: ObjectModel, unit: str) -> Iterator[tuple[Path, bytes]]:
+    """The paths and contents that `export_mesh` writes."""
+    texture = _Texture(model)
+    for name, data in obj_files(model, f"object coordinates, OpenCV axes, unit: {unit}", texture).items():
+        yield folder / name, data
+    yield folder / GLB, glb_file(model, texture=texture, unit=unit)
+    yield folder / FEATURES, _features_file(model)
 
 
 def _features_file(model: ObjectModel) -> bytes:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.results.records import FrameRecord
 
 MOSTLY = 0.5
@@ -51,6 +52,8 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
     deviation = camera.get("focal_deviation")
     if camera["assumed"] and (deviation is None or deviation > CERTAIN):
         uncertain = "" if deviation is None else f", uncertain by {100 * deviation:.0f} % of the focal length"
+        if deviation is not None and deviation > LENS_KNOWN:
+            uncertain = ", and the video does not tell it"
         notes.append(
             f"no focal length was given: {camera['origin']}{uncertain}; give --fov or --intrinsics if depth matters"
         )

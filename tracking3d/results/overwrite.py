@@ -70,7 +70,7 @@ def _run_files(folder: Path) -> list[Path]:
 
 def _check_replaceable(folder: Path, overwrite: bool, file: Path) -> None:
     try:
-        has_frames = _has_frames(RunReader(folder))
+        has_frames = _has_frames(RunReader(folder, whole=False))
     except FormatError:  # complete, but not readable by this version
         has_frames = True
     except InputError as error:

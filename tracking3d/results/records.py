@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.rigid import nearest_rigid
 from tracking3d.runtime.stage_times import StageTimes
 
 _KINDS: dict[str, Any] = {
@@ -136,6 +137,25 @@ class FrameRecord:
         """The record, with the time that writing masks and pictures took."""
         stages = None if self.stages is None else self.stages + StageTimes(write=seconds)
         return replace(self, stages=stages, seconds=self.seconds + seconds)
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the pose is known; else it is NaN."""
+        return bool(np.isfinite(self.T_cam_obj).all())
+
+    @classmethod
+    def from_line(cls, line: bytes, file: Path) -> Self:
+        """Read one line of a file, with the nearest rotation if what it has is so only nearly.
+
+        Raises:
+            ValueError: If it is not a whole and valid record, or its pose is not rigid.
+        """
+        record = cls.from_json(line)
+        if not record.has_pose:
+            return record
+        if (T_cam_obj := nearest_rigid(record.T_cam_obj, file)) is None:
+            raise ValueError(f"the pose of frame {record.index} is not a rotation and a translation")
+        return replace(record, T_cam_obj=T_cam_obj)
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:

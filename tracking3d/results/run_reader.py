@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -57,18 +57,22 @@ class RunReader:
     """A run folder as it was when each part was first read.
 
     Args:
-        folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
-        one; else all are causal.
+        folder: The run folder.
+        refined: Whether frames, masks and mesh are those of the final refinement, if there is one; else all are causal.
+        whole: Whether a run is refused whose scaling, or the taking over of whose correction, was interrupted: its
+            files are of two units, or of two runs.
 
     Raises:
-        InputError: If it is not a run folder.
+        InputError: If it is not a run folder, or not whole.
         FormatError: If it was written by an earlier or a later version.
     """
 
-    def __init__(self, folder: Path, refined: bool = True) -> None:
+    def __init__(self, folder: Path, refined: bool = True, whole: bool = True) -> None:
         self.folder = Path(folder)
         self.refined = refined
         self.description = _read_description(self.folder)
+        if whole:
+            _check_whole(self.folder, self.description)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -250,6 +254,29 @@ def is_finished(folder: Path) -> bool:
     return (folder / layout.RUN).is_file() and RunReader(folder).state == "finished"
 
 
+def replacement_has_begun(folder: Path) -> bool:
+    """Whether the corrected run is taking the place of a run: its lines do so first, its description last.
+
+    Raises:
+        InputError: If the description of the corrected run cannot be read.
+    """
+    stage = folder / layout.CORRECTING
+    return not (stage / layout.FRAMES).is_file() and is_finished(stage)
+
+
+def _check_whole(folder: Path, description: Mapping[str, Any]) -> None:
+    if description.get("scaling"):
+        raise InputError(
+            f"Only some files of {folder} are in metres, since that was interrupted; resume the run, or give "
+            "`tracking3d model` its --object-size, which completes it."
+        )
+    if replacement_has_begun(folder):
+        raise InputError(
+            f"Only some files of {folder} are those of its correction, since that was interrupted; repeat the "
+            "`tracking3d correct`, which completes it."
+        )
+
+
 def read_records(path: Path, end: int | None = None) -> Iterator[FrameRecord]:
     """All lines of a ``frames.jsonl``, revisions included; a last line that was cut off is left out.
 
@@ -269,7 +296,7 @@ def read_records(path: Path, end: int | None = None) -> Iterator[FrameRecord]:
             if end is not None and read > end:
                 return
             try:
-                yield FrameRecord.from_json(line)
+                yield FrameRecord.from_line(line, path)
             except ValueError as error:
                 # A kill cuts the last line off; what it leaves has a beginning and no end.
                 if line.startswith(b"{") and len(line) < LONGEST_LINE and not line.endswith(b"\n"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ from tracking3d.config.object_size import check_object_size
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.results import layout
-from tracking3d.results.files import write_atomic
+from tracking3d.results.files import write_together
 from tracking3d.results.layout import METRE
-from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.mesh_export import load_model, mesh_files
 from tracking3d.results.point_tracking import read_landmarks, write_landmarks
 from tracking3d.results.records import FrameRecord, latest
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.runtime.interruption import interrupts_deferred
 
 _HARDLY_SEEN = 0.1
 """Minimum share of seen faces for which the object's length can be computed from them."""
@@ -89,9 +91,9 @@ def apply_object_size(folder: Path, config: ObjectConfig) -> None:
         InputError: The run has no mesh to measure.
         OutputError: A file cannot be written.
     """
+    complete_scaling(folder)
     run = RunReader(folder)
-    done = run.unit == METRE and not run.description.get("scaling")
-    if run.state != "finished" or done:
+    if run.state != "finished" or run.unit == METRE:
         return
     if config.size is not None:
         scale_run(folder, config.size)
@@ -102,6 +104,18 @@ def apply_object_size(folder: Path, config: ObjectConfig) -> None:
     ):
         size = _scales(RunReader(Path(config.model))).object_size
         _scale_by(folder, replace(_scales(run), object_size=size), {run.mesh_folder: 1.0})
+
+
+def complete_scaling(folder: Path) -> None:
+    """Complete the scaling of a run if that was interrupted.
+
+    Raises:
+        InputError: A mesh is damaged.
+        OutputError: A file cannot be written.
+    """
+    run = folder / layout.RUN
+    if run.is_file() and (scaling := RunReader(folder, whole=False).description.get("scaling")):
+        _scale_files(folder, scaling)
 
 
 def scale_run(folder: Path, object_size: float) -> None:
@@ -117,12 +131,10 @@ def scale_run(folder: Path, object_size: float) -> None:
         InputError: The run is not finished, or has no mesh to measure.
         OutputError: A file cannot be written.
     """
-    run = RunReader(folder)
+    complete_scaling(folder)
+    run, causal = RunReader(folder), RunReader(folder, refined=False)
     if run.state != "finished":
         raise InputError(f"{run.not_finished} Its unit cannot be changed before it is finished; resume it.")
-    if run.description.get("scaling"):  # which was interrupted
-        _scale_files(folder, run.description["scaling"])
-    run, causal = RunReader(folder), RunReader(folder, refined=False)
     before = _scales(run)
     factor = metres_per_unit(load_model(run.mesh_folder), object_size)
     causal_factor = metres_per_unit(load_model(causal.mesh_folder), object_size)
@@ -141,13 +153,7 @@ def unit_scale(run: RunReader) -> float:
 
 
 def read_own_records(run: RunReader) -> list[FrameRecord]:
-    """The frames of a run in the unit that it was estimated in.
-
-    Raises:
-        InputError: The run is being scaled, and was interrupted.
-    """
-    if run.description.get("scaling"):
-        raise InputError(f"{run.folder} is in two units, since its scaling was interrupted; scale it again.")
+    """The frames of a run in the unit that it was estimated in."""
     if run.unit != METRE:
         return run.frames
     return latest(read_records(run.folder / layout.FRAMES, _scales(run).own_lines), refined=run.refined)
@@ -163,43 +169,38 @@ def load_own_model(run: RunReader, mesh_folder: Path) -> ObjectModel:
 
 
 def _scale_by(folder: Path, now: RunScale, factors: Mapping[Path, float]) -> None:
-    """Note what the scaling comes to, so that it can be completed if it is interrupted, and scale."""
+    """Scale all files by what is noted before the first is replaced, so that an interruption can be made good."""
     extents = {
         place.relative_to(folder).as_posix(): by * _extent(load_model(place))
         for place, by in factors.items()
         if (place / layout.FEATURES).is_file()
     }
-    scaling = {"to": asdict(now), "extents": extents}
-    note_in_run(folder, {"scaling": scaling})
-    _scale_files(folder, scaling)
+    _scale_files(folder, {"to": asdict(now), "extents": extents})
 
 
 def _scale_files(folder: Path, scaling: Mapping[str, Any]) -> None:
-    """Write every file in the new unit; what was written before an interruption stays as it is."""
+    """Write every file in the new unit; what was replaced before an interruption stays as it is."""
     now = RunScale(**scaling["to"])
-    landmarks = {
-        refined: found
-        for refined in (True, False)
-        if (found := read_landmarks(RunReader(folder, refined))) is not None
-    }
-    before = {refined: _extent(load_model(RunReader(folder, refined).mesh_folder)) for refined in landmarks}
-    _write_lines(folder, now)
-    for place, extent in scaling["extents"].items():
-        model = load_model(folder / place)
-        export_mesh(folder / place, scale_model(model, extent / _extent(model)), METRE)
-    for refined, (vertices, T_cam_obj) in landmarks.items():
-        run = RunReader(folder, refined)
-        by = _extent(load_model(run.mesh_folder)) / before[refined]
-        poses = np.stack([scale_pose(T, by) for T in T_cam_obj])
-        write_landmarks(run, vertices * by, poses)
-    note_in_run(folder, {"unit": {"name": METRE, **asdict(now)}, "scaling": {}})
-
-
-def _write_lines(folder: Path, now: RunScale) -> None:
+    runs = [RunReader(folder, refined, whole=False) for refined in (True, False)]
+    landmarks = [
+        (run, *found, _extent(load_model(run.mesh_folder)))
+        for run in runs
+        if (found := read_landmarks(run)) is not None
+    ]
     file = folder / layout.FRAMES
     own = list(read_records(file, now.own_lines))
     lines = b"".join(record.to_json().encode() + b"\n" for record in _scaled(own, now))
-    write_atomic(file, file.read_bytes()[: now.own_lines] + lines)
+    files = {file: file.read_bytes()[: now.own_lines] + lines}
+    for place, extent in scaling["extents"].items():
+        model = load_model(folder / place)
+        files.update(mesh_files(folder / place, scale_model(model, extent / _extent(model)), METRE))
+    with interrupts_deferred():
+        write_together(files, partial(note_in_run, folder, {"scaling": scaling}))
+        note_in_run(folder, {"unit": {"name": METRE, **asdict(now)}, "scaling": {}})
+    for before, vertices, T_cam_obj, extent in landmarks:
+        run = RunReader(folder, before.refined)
+        by = _extent(load_model(run.mesh_folder)) / extent
+        write_landmarks(run, vertices * by, np.stack([scale_pose(T, by) for T in T_cam_obj]))
 
 
 def _scaled(own: list[FrameRecord], now: RunScale) -> Iterator[FrameRecord]:

@@ -79,7 +79,7 @@ class ColourSegmentation:
         self,
         image: Image,
         box: Box,
-        mask: NDArray[np.bool_] | None = None,
+        mask: NDArray[np.bool_] | NDArray[np.float32] | None = None,
         size: int = 224,
         cues: Cues | None = None,
         network: PixelClassifier | None = None,
@@ -88,7 +88,7 @@ class ColourSegmentation:
             raise PluginError(f"The colour segmentation cannot be used: {why}.")
         self._size, self._cues, self._network = size, cues or Cues(), network
         self._image = image
-        self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)
+        self._mask = mask_in_box(image, box, warns=True) if mask is None else mask.astype(np.float32)
         self._velocity = (0, 0)
         self._doubtful_frames = 0
         self._usual_area = float(np.count_nonzero(self._mask > 0.5))

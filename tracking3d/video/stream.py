@@ -36,6 +36,8 @@ OPENING, READING = 10.0, 10.0
 """Timeouts in seconds: for the first data of a server, and between two packets."""
 TRIES = 3
 """Number of consecutive attempts to reconnect before the video counts as ended."""
+FORGOTTEN = 600.0
+"""Seconds after which it no longer counts that a stream ended; chosen. It may be given anew each time."""
 PAUSE = 1.0
 """Seconds before the first attempt; the wait doubles before each further one."""
 
@@ -115,7 +117,7 @@ class LiveStream:
         return check_frames(newest(self._frames()), self.name)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
-        indices, start, failed = counting(), None, 0
+        indices, start, failed, ends = counting(), None, 0, list[float]()
         while True:
             try:
                 for picture in self._pictures():
@@ -129,12 +131,18 @@ class LiveStream:
                         yield SkippedFrame(index, f"frame {index}: {picture}")
                     else:
                         yield frame_of(index, picture[0], now - start, picture[1])
-                reason = "it ended"
+                reason, now = "it ended", time.monotonic()
+                ends = [*(end for end in ends if now - end < FORGOTTEN), now]
             except InputError as error:
                 if start is None:
                     raise
                 reason = str(error)
             failed += 1
+            if len(ends) > TRIES:
+                _log.warning(
+                    "%s ended %d times; the run ends with the frames received.", self.name, len(ends)
+                )
+                return
             if failed > TRIES:
                 _log.warning(
                     "%s could not be reconnected after %d attempts; the run ends with the frames received.",

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.geometry.camera import Camera
@@ -163,10 +162,7 @@ class FollowedRun:
         self._read += len(whole)
         for line in whole.splitlines():
             try:
-                record = FrameRecord.from_json(line)
-                if np.isfinite(record.T_cam_obj).all() and not is_rigid(record.T_cam_obj):
-                    raise ValueError(f"the pose of frame {record.index} is not a rotation and a translation")
-                self._lines.append(record)
+                self._lines.append(FrameRecord.from_line(line, path))
             except ValueError as error:
                 raise InputError(f"A line of {path} is damaged ({error}); remove it.") from error
         self.frames = {record.index: record for record in latest(self._lines)}

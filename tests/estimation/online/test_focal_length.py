@@ -111,10 +111,11 @@ def test_a_small_turn_does_not_tell_the_lens():
     assert solve_lens(object_map, camera) == (object_map, camera)
 
 
-def test_what_no_lens_is_is_not_solved(narrow, monkeypatch):
+@pytest.mark.parametrize("degrees", [0.5, 6.7, 80.0])
+def test_beyond_the_outermost_lens_that_was_tried_it_is_not_known(narrow, monkeypatch, degrees):
     object_map, _, _ = narrow
     assumed = camera_of(45)
-    absurd = replace(assumed, fy=assumed.fy * 40)  # half a degree
+    absurd = camera_of(degrees)
     monkeypatch.setattr(
         focal_length, "adjust", lambda tracks, K, start, **how: replace(
             start, cost=0.1 if "free_focal" in how else 1.0, focal_factor=absurd.fy / assumed.fy

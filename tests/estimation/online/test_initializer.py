@@ -14,7 +14,11 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow
 from tracking3d.estimation.online.initialization import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
+from tracking3d.estimation.online.initialization.initializer import (
+    add_pending_frame,
+    try_initialize,
+    why_no_map,
+)
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
@@ -75,6 +79,33 @@ def test_without_motion_nothing_is_tried(asked):
     assert start is None
     assert state is given
     assert not asked["points"]
+
+
+def strangers(state: SolverState) -> SolverState:
+    """No point of a frame is found in another one."""
+    held = []
+    for number, (view, estimate) in enumerate(state.pending):
+        points = FollowedPoints(view.points.landmark + 1000 * number, view.points.pixel)
+        held.append((replace(view, points=points, strength=1.0), estimate))
+    return replace(state, pending=tuple(held))
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        (belief_of(STEADY[:3]), "a first map takes 4 frames that show the object, and there are 3"),
+        (replace(belief_of(STILL), pending=()), "and there are 0"),
+        (
+            strangers(belief_of(STEADY)),
+            "the views are too far apart: 0 % of the points of one are found again",
+        ),
+        (belief_of(STILL), "nothing shows that the object turns"),
+        (replace(belief_of(STILL), waiting_reason="the object has not moved yet"), "has not moved yet"),
+    ],
+    ids=["few", "none", "far apart", "still", "at rest"],
+)
+def test_a_video_that_ends_without_a_map_says_what_was_found(state, reason):
+    assert reason in why_no_map(state)
 
 
 def test_fewer_than_four_masks_are_too_few_however_it_moves(asked):

@@ -60,7 +60,7 @@ def test_the_first_answers_are_the_initial_masks_uncertain_and_say_why():
     assert early
     for estimate in early:
         assert estimate.status is Status.UNCERTAIN
-        assert "not moved enough" in estimate.reason
+        assert "do not tell the shape" in estimate.reason
         assert 0 < estimate.confidence < 0.5
         np.testing.assert_array_equal(estimate.mask, true_mask(estimate.index))
         np.testing.assert_array_equal(estimate.initial_mask, true_mask(estimate.index))
@@ -202,12 +202,20 @@ def test_an_object_that_is_still_stays_uncertain_and_says_why():
 
     state, estimates = run((still(index), true_mask(0)) for index in range(45))
     assert all(estimate.status is Status.UNCERTAIN and not estimate.revised for estimate in estimates)
-    assert "not moved enough" in estimates[20].reason
+    assert "do not tell the shape" in estimates[20].reason
     assert "has not moved yet" in estimates[-1].reason
     assert all((estimate.mask == true_mask(0)).all() for estimate in estimates)
     # What waits is bounded.
     assert state.pending is not None
     assert len(state.pending) <= 41
+
+
+def test_the_last_word_on_a_video_that_ends_without_a_map_is_what_was_found():
+    few = [(Frame(index, turning_clip().images[index]), true_mask(index)) for index in range(3)]
+    state, estimates = run(iter(few))
+    state = solver().refine(state)
+    _, last = solver().refine_frame(state, few[0][0], MaskEstimate(few[0][1]), estimates[0].T_cam_obj)
+    assert last.reason == "a first map takes 4 frames that show the object, and there are 3"
 
 
 def test_three_frames_are_too_few_and_still_answered():

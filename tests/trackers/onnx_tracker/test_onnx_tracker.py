@@ -8,11 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from onnxruntime import InferenceSession
 from pydantic import ValidationError
 from small_networks import nano_networks, saliency_network
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, MaskEstimate, Prompt
+from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.testing import check_tracker
 from tracking3d.testing.clips import moving_disc
 from tracking3d.trackers.crops import box_of
@@ -244,6 +246,20 @@ def test_a_network_that_finds_nothing_at_first_leaves_the_colours_in_the_box(fol
     assert ious([first], disc[1][:1])[0] > 0.8
 
 
+def test_the_ellipse_in_the_box_is_told_only_where_it_stands_for_the_object(
+    saliency, folder, tmp_path, caplog
+):
+    image = np.full((120, 160, 3), (60, 90, 150), np.uint8)
+    cv2.line(
+        image, (52, 42), (98, 78), (220, 90, 30), 2
+    )  # too thin for colours, and what the network looks for
+    blind = saliency_network(tmp_path / "blind.onnx", gain=0.0)
+    for model, said in ((saliency["model"], 0), (str(blind), 1)):
+        caplog.clear()
+        build({**saliency, "model": model}).init(Frame(0, image), Prompt((50.0, 40.0, 50.0, 40.0)))
+        assert len(caplog.records) == said
+
+
 def test_of_several_crops_the_mask_that_fits_the_colours_is_chosen(saliency, disc, monkeypatch):
     tracker = build(saliency)
     original = tracker._segmenter.propose
@@ -338,6 +354,38 @@ def test_what_is_no_network_is_refused(saliency, tmp_path):
     ):
         with pytest.raises(InputError, match=r"text\.onnx"):
             build({**saliency, **wrong})
+
+
+def test_a_network_that_answers_with_no_numbers_is_refused_when_it_is_made(saliency, tmp_path):
+    model = saliency_network(tmp_path / "odd.onnx", gain=float("nan"))
+    with pytest.raises(InputError, match=r"'salient' of .*odd\.onnx is not a number"):
+        build({**saliency, "model": str(model)})
+    description = tmp_path / "zero.yaml"
+    description.write_text("kind: saliency\ninput: {size: 64, divisor: 0}\n")
+    with pytest.raises(InputError, match=r"zero\.yaml.*divisor"):
+        build({**saliency, "segmenter": str(description)})
+
+
+def test_a_box_network_that_cannot_track_is_refused_when_it_is_made(saliency, nano, tmp_path):
+    wrong = saliency["model"]
+    for options, told in (
+        ({"box": "vit", "vit_model": wrong}, "TrackerVit cannot track by"),
+        (
+            {**nano, "nano_backbone": nano["nano_head"], "nano_head": nano["nano_backbone"]},
+            "TrackerNano cannot",
+        ),
+    ):
+        with pytest.raises(InputError, match=told):
+            build({**saliency, **options})
+
+
+def test_numbers_that_become_none_in_a_later_frame_are_the_reason_of_that_frame(saliency, disc, monkeypatch):
+    tracker = GuardedTracker(build(saliency), "tracker 'onnx'")
+    tracker.init(disc[0][0], Prompt(box_around(disc[1][0])))
+    run = InferenceSession.run
+    monkeypatch.setattr(InferenceSession, "run", lambda *given: [np.nan * out for out in run(*given)])
+    with pytest.raises(PluginFailure, match="is not a number"):
+        tracker.step(disc[0][1])
 
 
 @pytest.mark.slow

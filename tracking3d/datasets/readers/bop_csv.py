@@ -9,17 +9,17 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.datasets.answers import Answers
-from tracking3d.datasets.clip import is_rigid
 from tracking3d.datasets.readers.text_files import read_text
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
+from tracking3d.geometry.rigid import nearest_rigid
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
@@ -77,11 +77,7 @@ def answers_from_bop_csv(
         origin=file,
         asked=range(len(truth.frames)),
         answered=frozenset(best),
-        T_cam_obj={
-            n: _in_units(one.T_cam_obj, truth.millimetres or 1.0)
-            for n, one in best.items()
-            if is_rigid(one.T_cam_obj)
-        },
+        T_cam_obj={n: _in_units(one.T_cam_obj, truth.millimetres or 1.0) for n, one in best.items()},
         confidence={n: one.score for n, one in best.items()} if scores_are_confidence else {},
         seconds={n: one.seconds for n, one in best.items() if one.seconds >= 0},
     )
@@ -112,6 +108,9 @@ def _estimate(file: Path, number: int, row: list[str]) -> _Estimate:
         ) from error
     if not np.isfinite(pose).all():
         raise InputError(f"Line {number} of {file} has a pose with values that are not finite; remove it.")
+    if (rigid := nearest_rigid(pose, file)) is None:
+        raise InputError(f"Line {number} of {file} (image {one.im_id}): R is not a rotation; correct it.")
+    one = replace(one, T_cam_obj=rigid)
     if not (math.isfinite(one.score) and math.isfinite(one.seconds)):
         raise InputError(f"Line {number} of {file} has a score or time that is not finite; correct it.")
     return one

@@ -48,7 +48,7 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import begin_again
-from tracking3d.estimation.online.initialization.initializer import restart_misfit, try_initialize
+from tracking3d.estimation.online.initialization.initializer import restart_misfit, try_initialize, why_no_map
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
@@ -151,7 +151,7 @@ class OnlineSolver(MapInitialization):
         if state.phase is SolverPhase.INITIALIZING:
             state, start = try_initialize(state, self.online, ended=True)
             if start is None:
-                return state
+                return replace(state, waiting_reason=why_no_map(state))
             state, _ = self._initialize(state, start)
         state = merge_maps(state, self.online, state.object_map.keyframes)
         state = activate_largest_map(
@@ -188,7 +188,8 @@ class OnlineSolver(MapInitialization):
         T_cam_obj = state.extended.get(frame.index, T_cam_obj)
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
         if state.surface is None:
-            return state, replace(initial_estimate(frame, binary, causal, state.camera), refined=True)
+            waiting = initial_estimate(frame, binary, causal, state.camera)
+            return state, replace(waiting, reason=state.waiting_reason or waiting.reason, refined=True)
         starts = {"causal": causal}
         followed = follow(state.grey, image, state.tracked_points)
         own = next((view for view in object_map.keyframes if view.index == frame.index), None)

@@ -13,6 +13,7 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+from tracking3d.trackers.onnx.images import TRIAL_BOX, TRIAL_IMAGE
 from tracking3d.trackers.onnx.siamese_boxes import SiameseBoxes
 from tracking3d.trackers.opencv_build import why_no_contrib
 
@@ -54,11 +55,28 @@ class CsrtBoxes:
 
 
 class NetworkBoxes:
-    """A tracker of OpenCV that runs on networks: ``cv2.TrackerNano`` or ``cv2.TrackerVit``."""
+    """A tracker of OpenCV that runs on networks: ``cv2.TrackerNano`` or ``cv2.TrackerVit``.
 
-    def __init__(self, tracker: Any) -> None:
-        self._tracker = tracker
+    Args:
+        kind: Which of them.
+        files: Its ONNX files.
+
+    Raises:
+        InputError: If a file is no network that OpenCV can run, or it cannot track by it.
+    """
+
+    def __init__(self, kind: Any, *files: Path) -> None:
+        # Networks are read first: given by name in Params, OpenCV would print warnings about its own defaults.
+        self._tracker = kind.create(*(_read_output(file) for file in files))
         self._started = False
+        try:
+            self._tracker.init(TRIAL_IMAGE, TRIAL_BOX)
+            self._tracker.update(TRIAL_IMAGE)
+        except cv2.error as error:
+            raise InputError(
+                f"OpenCV's {kind.__name__} cannot track by {' and '.join(map(str, files))} ({error.err}); give the "
+                "files that were exported for it."
+            ) from error
 
     def start(self, image: Image, box: Box) -> None:
         """See `BoxProposer.start`."""
@@ -95,7 +113,7 @@ def nano_boxes(backbone: Path, head: Path, threads: int = 1) -> BoxProposer:
         InputError: If a file is no such network.
     """
     if not SiameseBoxes.is_head(head):
-        return NetworkBoxes(_create(cv2.TrackerNano, backbone, head))
+        return NetworkBoxes(cv2.TrackerNano, backbone, head)
     return SiameseBoxes(backbone, head, threads)
 
 
@@ -105,12 +123,7 @@ def vit_boxes(model: Path) -> NetworkBoxes:
     Raises:
         InputError: If the file is no network that OpenCV can run.
     """
-    return NetworkBoxes(_create(cv2.TrackerVit, model))
-
-
-def _create(kind: Any, *files: Path) -> Any:
-    # Networks are read first: given by name in Params, OpenCV would print warnings about its own defaults.
-    return kind.create(*(_read_output(file) for file in files))
+    return NetworkBoxes(cv2.TrackerVit, model)
 
 
 def _read_output(file: Path) -> Any:

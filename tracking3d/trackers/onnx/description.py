@@ -36,7 +36,7 @@ class ImageInput(Section):
         description="Stretch to the size, or keep the proportions and pad at the right and below.",
     )
     padding: Triple = Field((0.0, 0.0, 0.0), description="Red, green, blue of the padding, 0 to 255.")
-    divisor: float | Literal["max"] = Field(
+    divisor: Annotated[float, Field(gt=0)] | Literal["max"] = Field(
         255.0, description="Divisor of pixel values; max is the largest value of the image."
     )
     mean: Triple = Field((0.0, 0.0, 0.0), description="Mean subtracted after the division: red, green, blue.")

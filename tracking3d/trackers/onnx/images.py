@@ -11,6 +11,11 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.onnx.description import ImageInput
 
+TRIAL_IMAGE: Image = np.full((256, 256, 3), 90, np.uint8)
+"""A bright square in `TRIAL_BOX` on grey: what a network is asked about when it is made."""
+TRIAL_BOX = (112, 112, 32, 32)
+TRIAL_IMAGE[112:144, 112:144] = 255, 120, 20
+
 
 @dataclass(frozen=True)
 class Letterbox:

@@ -12,6 +12,7 @@ from tracking3d.networks.store import find_network
 from tracking3d.trackers.csrt import CsrtTracker
 from tracking3d.trackers.onnx.boxes import BoxProposer, CsrtBoxes, nano_boxes, vit_boxes
 from tracking3d.trackers.onnx.description import SaliencyNetwork, load_segmenter_description
+from tracking3d.trackers.onnx.images import TRIAL_BOX, TRIAL_IMAGE
 from tracking3d.trackers.onnx.promptable import PromptableSegmenter
 from tracking3d.trackers.onnx.proposals import Segmenter
 from tracking3d.trackers.onnx.saliency import SaliencySegmenter
@@ -53,22 +54,26 @@ class OnnxOptions(Options):
 
 
 def build_segmenter(options: OnnxOptions) -> Segmenter:
-    """The segmentation network that ``options`` ask for.
+    """The segmentation network that ``options`` ask for, once it was asked about an image.
 
     Raises:
-        InputError: If a description or a file is missing or cannot be used.
+        InputError: If a description or a file is missing or cannot be used, or if what it says is no mask.
     """
     description = load_segmenter_description(options.segmenter)
 
     def file(option: str, given: str | None, default: str | None) -> Path:
         return _file(option, given or default, f"the segmenter '{options.segmenter}'")
 
+    segmenter: Segmenter
     if isinstance(description, SaliencyNetwork):
         model = file("model", options.model, description.model)
-        return SaliencySegmenter(model, description, options.crops, options.threads)
-    encoder = file("encoder", options.encoder, description.encoder_model)
-    decoder = file("decoder", options.decoder, description.decoder_model)
-    return PromptableSegmenter(encoder, decoder, description, options.threads)
+        segmenter = SaliencySegmenter(model, description, options.crops, options.threads)
+    else:
+        encoder = file("encoder", options.encoder, description.encoder_model)
+        decoder = file("decoder", options.decoder, description.decoder_model)
+        segmenter = PromptableSegmenter(encoder, decoder, description, options.threads)
+    segmenter.propose(TRIAL_IMAGE, TRIAL_BOX, None)
+    return segmenter
 
 
 def build_boxes(options: OnnxOptions) -> BoxProposer:

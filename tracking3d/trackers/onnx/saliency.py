@@ -83,7 +83,7 @@ class SaliencySegmenter:
         if self._description.normalise:
             low, high = float(shares.min()), float(shares.max())
             shares = (shares - low) / max(high - low, 1e-6)
-        return np.clip(np.nan_to_num(shares, nan=0.0), 0.0, 1.0)
+        return np.clip(shares, 0.0, 1.0)
 
 
 def validate_name(name: str | None, names: Mapping[str, object], file: Path, what: str) -> str:

@@ -17,6 +17,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
 from tracking3d.trackers.crops import clip_box
+from tracking3d.trackers.onnx.images import TRIAL_BOX, TRIAL_IMAGE
 
 _TEMPLATE, _SEARCH = 127, 255  # pixels: sides of the template and of the search region
 _STRIDE = 16
@@ -61,8 +62,16 @@ class SiameseBoxes:
                     f"{network.file} is not a network of NanoTrack 3: it has {len(network.inputs)} inputs and "
                     f"{len(network.outputs)} outputs, not {inputs} of each; give its backbone and its head."
                 )
-        self._place: _Place | None = None
         self._template: NDArray[np.float32]
+        try:
+            self.start(TRIAL_IMAGE, TRIAL_BOX)
+            self.update(TRIAL_IMAGE)
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{backbone} and {head} are not the networks of NanoTrack 3: what they answer has other sizes "
+                f"({error}); give its backbone and its head."
+            ) from error
+        self._place: _Place | None = None
 
     @staticmethod
     def is_head(file: Path) -> bool:

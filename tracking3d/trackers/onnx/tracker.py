@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
+from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
 from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
 from tracking3d.trackers.onnx.proposals import PointSegmenter
@@ -98,14 +99,16 @@ class OnnxTracker:
     def _first_answer(self, image: Image, prompt: Prompt) -> MaskEstimate:
         if prompt.mask is not None:
             return self._by_points(image, prompt.mask, prompt.points)
-        guess = ColourSegmentation(image, prompt.box).estimate
+        guess = ColourSegmentation(image, prompt.box, mask_in_box(image, prompt.box)).estimate
         if guess.mask is None:
             return guess
         judge = ColourJudge(image, guess.mask)
         best = self._best(judge, image, prompt.box, None, prompt.box)
         if reason := _unusable(best):
             return MaskEstimate(
-                guess.mask, guess.score / 2, f"{reason}; the box was segmented by colour instead"
+                mask_in_box(image, prompt.box, warns=True),
+                guess.score / 2,
+                f"{reason}; the box was segmented by colour instead",
             )
         return MaskEstimate(best.proposal.mask, best.score)
 

@@ -186,6 +186,25 @@ def try_initialize(
     return state, starts[0] if starts else None
 
 
+def why_no_map(state: SolverState) -> str:
+    """What was found where the pending frames do not determine a map, though no more follow."""
+    views = [view for view, _ in state.pending or () if view.mask is not None]
+    if len(views) < _MIN_FRAMES:
+        return f"a first map takes {_MIN_FRAMES} frames that show the object, and there are {len(views)}"
+    kept = [
+        float(np.isin(a.points.landmark, b.points.landmark).mean())
+        for a, b in pairwise(views)
+        if len(a.points)
+    ]
+    again = float(np.median(kept)) if kept else 0.0
+    if np.median([view.strength for view in views]) >= PLAIN and again <= _MIN_SHARED:
+        return (
+            f"the views are too far apart: {100 * again:.0f} % of the points of one are found again in the next; take "
+            "more in between"
+        )
+    return state.waiting_reason or _STILL
+
+
 def _starts_from_points(state: SolverState, views: list[Keyframe], config: OnlineConfig) -> list[InitialMap]:
     weights = FitWeights(smoothness=config.smoothness)
     return solve_start(state.object_map, lens_hypotheses(state.camera), views, weights, config.surface_prior)

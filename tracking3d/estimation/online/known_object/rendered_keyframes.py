@@ -85,7 +85,6 @@ def map_of_known_object(
         (),
         np.zeros(0, bool),
         renderer=renderer,
-        fixed_keyframes=SIDES,
     )
     camera = Camera.from_fov(_PICTURE, _PICTURE, _FIELD_OF_VIEW)
     distance = RADIUS / math.sin(_FILLED * math.radians(_FIELD_OF_VIEW) / 2)
@@ -94,6 +93,8 @@ def map_of_known_object(
     for number, R in enumerate(sides(SIDES)):
         pose = pose_from_arrays(R, np.array([0.0, 0.0, distance]), shape.rest)
         drawing = render_side(shape, colours, pose, camera, renderer)
+        if not drawing.mask.any():
+            continue  # a flat thing, from its edge
         # Drawn sides come before the first frame.
         frame = Frame(number - SIDES, drawing.image)
         window = Window.around(mask_box(drawing.mask), config.crop.margin, config.crop.size)
@@ -115,7 +116,7 @@ def map_of_known_object(
         )
         for number, view in enumerate(learnt.keyframes)
     )
-    return replace(learnt, keyframes=keyframes), space
+    return replace(learnt, keyframes=keyframes, fixed_keyframes=len(keyframes)), space
 
 
 def sides(count: int) -> list[NDArray[np.float64]]:

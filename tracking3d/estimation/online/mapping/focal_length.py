@@ -13,16 +13,15 @@ import numpy as np
 import torch
 
 from tracking3d.bundle_adjustment.adjustment import Structure, adjust
-from tracking3d.config.camera import USUAL_ANGLES
 from tracking3d.estimation.online.mapping.local_mapping import shared_landmarks, structure_of, tracks_of
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import OUTERMOST_LENSES, Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
-_INITIAL_FIELDS_OF_VIEW = (9.0, 16.0, 27.0, 65.0)  # besides the assumed one
+_INITIAL_FIELDS_OF_VIEW = (OUTERMOST_LENSES[0], 16.0, 27.0, OUTERMOST_LENSES[1])  # besides the assumed one
 _MIN_GAIN = 0.08  # relative gain required of twice or half the focal length; less for nearer ones
 _SAME_FOCAL_LENGTH = math.log(1.05)  # focal lengths within this ratio are the same
 _ITERATIONS = 25
@@ -119,7 +118,7 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
     for lens in (1.0, *(focal / camera.fy for focal in candidates)):
         stretched = replace(start, t=start.t * [1.0, 1.0, lens], focal_factor=lens)
         tried.append(adjust(tracks, camera.K, stretched, iterations=_ITERATIONS, free_focal=True))
-    tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
+    tried = [one for one in tried if camera.may_have(one.focal_factor)]
     best = min(tried, key=lambda one: one.cost, default=kept)
     change = lens_change(best.focal_factor)
     if (
@@ -128,12 +127,6 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
     ):
         return object_map, camera
     return _with_lens(object_map, camera, names, best)
-
-
-def _is_a_lens(factor: float, camera: Camera) -> bool:
-    least, most = USUAL_ANGLES
-    degrees = camera.zoom(factor, "").fov
-    return least <= degrees <= most
 
 
 def _with_lens(

@@ -23,7 +23,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_from_arrays
-from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_scene
+from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
 from tracking3d.points.robust_bundle import intersect
 
 _ROUNDS = 2
@@ -76,7 +76,7 @@ def _refine_map(
     scene = draw_keyframes(object_map, camera, list(range(len(object_map.keyframes))))
     if scene.views[0] is None or sum(view is not None for view in scene.views) < _LEAST_KEYFRAMES:
         return None
-    scene = refine_scene(scene, _ROUNDS, free_focal=camera.assumed)
+    scene = refine_through(scene, _ROUNDS, camera)
     if not is_supported(scene):
         return None
     if scene.focal_factor != 1:

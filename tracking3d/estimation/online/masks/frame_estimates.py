@@ -19,8 +19,6 @@ from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
-WAITING = "the object has not moved enough yet to tell its shape"
-
 
 def initial_estimate(
     frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose, camera: Camera
@@ -33,7 +31,7 @@ def initial_estimate(
         mask=mask if mask is not None else np.zeros(frame.size, dtype=np.bool_),
         initial_mask=mask,
         status=Status.UNCERTAIN,
-        reason=WAITING,
+        reason="the frames so far do not tell the shape of the object",
         confidence=0.3,
         mask_source=MaskSource.as_initial(mask),
         camera=camera,
