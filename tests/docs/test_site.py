@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import os
 import re
@@ -50,6 +51,28 @@ def test_the_reference_names_what_there_is():
             pytest.fail(name)
         if module != "tracking3d":
             assert getattr(importlib.import_module(module), attribute).__doc__, name
+
+
+def nameless_arguments(text: str) -> list[str]:
+    """The lines of a docstring's list of arguments, attributes or errors that do not say of what they speak."""
+    lists = re.findall(r"^(?:Args|Attributes|Raises):\n((?:[ ]{4}.*\n?|\n(?=[ ]{4}))+)", text, re.M)
+    lines = [line[4:] for part in lists for line in part.splitlines() if not line.startswith(" " * 5)]
+    return [line for line in lines if line.strip() and not re.match(r"[*\w., ]+( \([^)]*\))?: ?", line)]
+
+
+def test_docstrings_name_each_argument_on_a_line_of_its_own():
+    documented = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    at_fault = {
+        f"{file.relative_to(ROOT)}: {node.name}": lines
+        for file in sorted((ROOT / "tracking3d").rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, documented) and (lines := nameless_arguments(ast.get_docstring(node) or ""))
+    }
+    assert at_fault == {}
+
+
+def test_continuous_integration_builds_the_site():
+    assert "docs" in (ROOT / ".ci/run").read_text(encoding="utf-8").split("make ")[-1].split()
 
 
 def hook(site: dict[str, Any], name: str) -> ModuleType:

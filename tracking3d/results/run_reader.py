@@ -57,8 +57,8 @@ class RunReader:
     """A run folder as it was when each part was first read.
 
     Args:
-        folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
-        one; else all are causal.
+        folder: The run folder.
+        refined: Whether frames, masks and mesh are those of the final refinement, if there is one, or all causal.
 
     Raises:
         InputError: If it is not a run folder.
