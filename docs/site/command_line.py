@@ -45,23 +45,36 @@ on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 def command_line_page() -> str:
     """The whole page, as Markdown."""
     commands = typer.main.get_command(app).commands
-    return "\n".join([HEAD, *(part for name, one in commands.items() for part in sections([name], one))])
+    known = set(rows_of(commands["run"]))
+    return "\n".join(
+        [HEAD, *(part for name, one in commands.items() for part in sections([name], one, known))]
+    )
 
 
-def sections(path: list[str], command: Any) -> Iterator[str]:
-    """Heading, usage, help and options of a command, and the same of the commands inside it."""
+def sections(path: list[str], command: Any, known: set[tuple[str, str]]) -> Iterator[str]:
+    """Heading, usage, help and options of a command, and the same of the commands inside it.
+
+    Args:
+        path: The words after `tracking3d`.
+        command: The command, one of click's as typer brings it along.
+        known: The options of `run`: another command that has the same ones only names them.
+    """
     inner = getattr(command, "commands", {})
     yield f"{'#' * (len(path) + 1)} {' '.join(path)}\n"
     if not inner:
         arguments = [one.metavar for one in command.params if not is_option(one)]
         yield f"`{' '.join(['tracking3d', *path, *arguments])}`\n"
     yield as_markdown(command.help or "") + "\n"
-    context = command.context_class(command)
-    shown = [one for one in command.params if not one.hidden and not IN_THE_HEAD & set(one.opts)]
-    if rows := [row(one, context) for one in sorted(shown, key=is_option)]:
-        yield "\n".join(["| | |", "|---|---|", *rows]) + "\n"
+    rows = [one for one in rows_of(command) if path == ["run"] or one not in known]
+    shared = [names for names, meaning in rows_of(command) if path != ["run"] and (names, meaning) in known]
+    if shared:
+        rows.append((", ".join(shared), "As for [run](#run)."))
+    if rows:
+        yield (
+            "\n".join(["| | |", "|---|---|", *(f"| {names} | {meaning} |" for names, meaning in rows)]) + "\n"
+        )
     for name, below in inner.items():
-        yield from sections([*path, name], below)
+        yield from sections([*path, name], below, known)
 
 
 def is_option(parameter: Any) -> bool:
@@ -69,16 +82,23 @@ def is_option(parameter: Any) -> bool:
     return bool(parameter.param_type_name == "option")
 
 
-def row(parameter: Any, context: Any) -> str:
-    """A line of the table of a command's arguments and options."""
+def rows_of(command: Any) -> list[tuple[str, str]]:
+    """The arguments and options of a command, each with its meaning, as cells of a table."""
+    context = command.context_class(command)
+    shown = [one for one in command.params if not one.hidden and not IN_THE_HEAD & set(one.opts)]
+    return [cells(one, context) for one in sorted(shown, key=is_option)]
+
+
+def cells(parameter: Any, context: Any) -> tuple[str, str]:
+    """How an argument or option is written, and what it means."""
     names = [parameter.metavar]
     if is_option(parameter):
         kind = parameter.metavar or parameter.display_type(context).strip("<>").removesuffix(" range")
         value = "" if parameter.is_flag else f" {kind}"
         names = [f"{name}{value}" for name in (*parameter.opts, *parameter.secondary_opts)]
     default = f" Default: {parameter.show_default}." if isinstance(parameter.show_default, str) else ""
-    cells = ", ".join(f"`{name}`" for name in names), as_markdown(parameter.help) + default
-    return "| " + " | ".join(cell.replace("\n\n", " ").replace("|", "\\|") for cell in cells) + " |"
+    meaning = as_markdown(parameter.help).replace("\n\n", " ") + default
+    return ", ".join(f"`{name}`" for name in names).replace("|", "\\|"), meaning.replace("|", "\\|")
 
 
 def as_markdown(text: str) -> str:
