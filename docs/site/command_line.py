@@ -1,5 +1,7 @@
 """Writes docs/command-line.md from the help of the program; a test says when it has to be run again.
 
+The commands with which trackers are measured have a page beside the scripts for that, benchmarks/command-line.md.
+
 $ python docs/site/command_line.py
 """
 
@@ -14,7 +16,8 @@ import typer
 
 from tracking3d.cli import app
 
-PAGE = Path(__file__).resolve().parents[1] / "command-line.md"
+ROOT = Path(__file__).resolve().parents[2]
+MEASURING = ("synth", "evaluate", "bench")
 IN_THE_HEAD = {"--help", "--debug", "--quiet"}
 """Options that mean the same in every command."""
 
@@ -32,6 +35,9 @@ completion in your shell.
 Commands that take longer than a moment say on the standard error what they are doing, with a count and the time left:
 on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 
+`synth`, `evaluate` and `bench`, with which trackers are measured, are on
+[a page of the repository](../benchmarks/command-line.md); [measures](measures.md) begins with them.
+
 | exit code | |
 |---|---|
 | 0 | success |
@@ -41,14 +47,30 @@ on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 | 141 | the output is piped into a program that has ended, as in `\\| head -1` |
 """
 
+MEASURING_HEAD = """# Commands that measure
 
-def command_line_page() -> str:
-    """The whole page, as Markdown."""
+What `tracking3d synth`, `evaluate` and `bench` print with `--help`, as one page (`docs/site/command_line.py` makes it).
+[The command line](../docs/command-line.md) has all others, and what holds for every command.
+"""
+
+
+def pages() -> dict[Path, str]:
+    """Every page that is made here, as Markdown."""
     commands = typer.main.get_command(app).commands
     known = set(rows_of(commands["run"]))
-    return "\n".join(
-        [HEAD, *(part for name, one in commands.items() for part in sections([name], one, known))]
+    used, measuring = (
+        [
+            part
+            for name, one in commands.items()
+            if (name in MEASURING) == chosen
+            for part in sections([name], one, known)
+        ]
+        for chosen in (False, True)
     )
+    return {
+        ROOT / "docs/command-line.md": "\n".join([HEAD, *used]),
+        ROOT / "benchmarks/command-line.md": "\n".join([MEASURING_HEAD, *measuring]),
+    }
 
 
 def sections(path: list[str], command: Any, known: set[tuple[str, str]]) -> Iterator[str]:
@@ -68,7 +90,7 @@ def sections(path: list[str], command: Any, known: set[tuple[str, str]]) -> Iter
     rows = [one for one in rows_of(command) if path == ["run"] or one not in known]
     shared = [names for names, meaning in rows_of(command) if path != ["run"] and (names, meaning) in known]
     if shared:
-        rows.append((", ".join(shared), "As for [run](#run)."))
+        rows.append((", ".join(shared), "As for `run`."))
     if rows:
         yield (
             "\n".join(["| | |", "|---|---|", *(f"| {names} | {meaning} |" for names, meaning in rows)]) + "\n"
@@ -111,4 +133,5 @@ def as_markdown(text: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(command_line_page(), encoding="utf-8")
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
