@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import pytest
 import yaml
-from documentation_pages import PAGES, ROOT, label
+from documentation_pages import PAGES, ROOT, commands, label
 
 from tracking3d.config.loading import list_presets, load_config
 from tracking3d.config.models import PipelineConfig
@@ -48,6 +48,27 @@ def test_the_readme_shows_a_picture_before_anything_is_installed():
     pictures = re.findall(r"!\[[^]]+\]\((docs/images/[^)]+)\)", first_screen)
     assert pictures
     assert sum((ROOT / picture).stat().st_size for picture in pictures) < 1_500_000
+
+
+def test_the_readme_says_for_whom_it_is_and_begins_with_the_picker():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for_whom = readme.partition("\n## Is it for you?\n")[2].partition("\n## ")[0]
+    assert "| | works | does not |" in for_whom
+    for word in ("by hand", "on a table", "printed", "a third of the picture", "plain", "shiny", "soft"):
+        assert word in for_whom, word
+    assert [line.split()[0] for line in commands(ROOT / "README.md", "tracking3d")][:2] == ["pick", "run"]
+
+
+def test_the_readme_installs_without_gigabytes_that_nobody_needs():
+    [install, *_] = commands(ROOT / "README.md", "pip")
+    assert "whl/cpu" in install
+
+
+def test_figures_of_the_readme_say_when_they_were_measured():
+    figures = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Figures\n")[2]
+    lines = [line for line in figures.partition("\n## ")[0].splitlines() if line.startswith("- ")]
+    assert lines and all(re.match(r"- \*\*.+\*\* \(\d{4}-\d\d-\d\d\): ", line) for line in lines)
+    assert len(figures.partition("\n## ")[0].split()) < 250
 
 
 def test_every_page_is_in_the_index():
