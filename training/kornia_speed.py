@@ -248,7 +248,7 @@ def features(generator: torch.Generator) -> None:
 
 
 def patches(stride: int, generator: torch.Generator) -> None:
-    """One around every so manyeth pixel."""
+    """One around every n-th pixel."""
     side = 256 + 32 - stride
     grey = torch.rand(1, 1, side, side, generator=generator)
     row(

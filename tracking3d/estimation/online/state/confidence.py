@@ -224,7 +224,7 @@ def assess_pose(
     if astray and few and confidence < TRACKED_CONFIDENCE:
         status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
-            status, "after the loss, what was found may be another object", min(confidence, _OUTLINE_ONLY)
+            status, "found again after a loss; could be a different object", min(confidence, _OUTLINE_ONLY)
         )
     if far:
         reason = f"the points fit, the appearance does not (loss {fit.appearance:.2f})"
