@@ -71,6 +71,42 @@ def test_figures_of_the_readme_say_when_they_were_measured():
     assert len(figures.partition("\n## ")[0].split()) < 250
 
 
+def test_tables_of_the_benchmark_say_of_which_version_they_are():
+    sections = (ROOT / "docs/benchmark.md").read_text(encoding="utf-8").split("\n## ")
+    measured = [section for section in sections if "\n|---" in section]
+    assert measured
+    for section in measured:
+        assert re.search(r"revision [0-9a-f]{7}, \d{4}-\d\d-\d\d", section), section.partition("\n")[0]
+
+
+def test_there_is_a_page_for_who_is_lost():
+    page = (ROOT / "docs/when-it-is-lost.md").read_text(encoding="utf-8")
+    for subject in (
+        "A moving camera",
+        "Grey pictures",
+        "One camera only",
+        "Light that stays with the camera",
+    ):
+        assert re.search(rf"^- \*\*{subject}\*\*", page, re.M), subject
+    for file in ("README.md", "docs/index.md", "docs/getting-started.md"):
+        assert "when-it-is-lost.md" in (ROOT / file).read_text(encoding="utf-8"), file
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("KV-Tracker", "https://github.com/Marwan99/kv_tracker"),
+        ("ProxyPose", "https://github.com/ruihangzhang97/proxypose"),
+        ("OnlineSplatter", "https://arxiv.org/abs/2510.20605"),
+        ("a turntable", "https://github.com/alicevision/AliceVision/pull/1943"),
+        ("the two sides of an object", "https://github.com/alicevision/AliceVision/pull/1944"),
+    ],
+)
+def test_alternatives_name_what_others_have_and_where_they_say_so(name, source):
+    page = (ROOT / "docs/alternatives.md").read_text(encoding="utf-8")
+    assert f"[{name}]({source}" in page
+
+
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
     for page in ROOT.glob("docs/**/*.md"):
