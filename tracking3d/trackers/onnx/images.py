@@ -16,10 +16,7 @@ from tracking3d.trackers.onnx.description import ImageInput
 class Letterbox:
     """How an image lies in a network's input.
 
-    Attributes:
-        image: Height and width of the image.
-        content: Height and width that the image takes in the input, from its upper left corner.
-        input: Height and width of the input.
+    All sizes are height and width; ``content`` is what the image takes in the input, from its upper left corner.
     """
 
     image: tuple[int, int]
