@@ -1,4 +1,4 @@
-"""What kornia does here and what it could do: milliseconds of one call on one thread; docs/kornia.md has the figures.
+"""What kornia does here and could do: milliseconds of one call on one thread; history/pages/kornia.md has figures.
 
 Each operation is written down twice, as it is or was without kornia and with it. The two take turns, so that whatever
 else the machine does slows both.
@@ -248,7 +248,7 @@ def features(generator: torch.Generator) -> None:
 
 
 def patches(stride: int, generator: torch.Generator) -> None:
-    """One around every so manyeth pixel."""
+    """One around every n-th pixel."""
     side = 256 + 32 - stride
     grey = torch.rand(1, 1, side, side, generator=generator)
     row(

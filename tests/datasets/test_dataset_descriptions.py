@@ -463,7 +463,7 @@ def test_a_sequence_without_any_truth_has_nothing_to_score(read):
 
 
 def test_the_documentation_names_every_description_and_key():
-    page = (Path(__file__).resolve().parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "benchmarks/datasets.md").read_text(encoding="utf-8")
     models = (
         DatasetLayout,
         Sequences,

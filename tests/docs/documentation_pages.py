@@ -12,9 +12,13 @@ HOW_TO = sorted(ROOT.glob("docs/how-to/*.md"))
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *sorted(ROOT.glob("docs/**/*.md")),
+    *sorted(ROOT.glob("benchmarks/*.md")),
     *sorted(ROOT.glob("plugins/*/README.md")),
     *sorted(ROOT.glob("examples/**/*.md")),
 ]
+
+HISTORY = sorted(ROOT.glob("history/**/*.md"))
+"""Pages as they were: what they say of the program was true on their day."""
 
 _BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<text>.*?)^(?P=indent)```$", re.M | re.S)
 

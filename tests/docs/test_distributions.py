@@ -91,6 +91,7 @@ def test_the_source_distribution_holds_the_project(sdist_names):
         "conda",
         "configs",
         "examples",
+        "history",
         "tests",
         "plugins",
         "training",

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import pytest
 import yaml
-from documentation_pages import PAGES, ROOT, label
+from documentation_pages import PAGES, ROOT, commands, label
 
 from tracking3d.config.loading import list_presets, load_config
 from tracking3d.config.models import PipelineConfig
@@ -48,6 +48,63 @@ def test_the_readme_shows_a_picture_before_anything_is_installed():
     pictures = re.findall(r"!\[[^]]+\]\((docs/images/[^)]+)\)", first_screen)
     assert pictures
     assert sum((ROOT / picture).stat().st_size for picture in pictures) < 1_500_000
+
+
+def test_the_readme_says_for_whom_it_is_and_begins_with_the_picker():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for_whom = readme.partition("\n## Is it for you?\n")[2].partition("\n## ")[0]
+    assert "| | works | does not |" in for_whom
+    for word in ("by hand", "on a table", "printed", "a third of the picture", "plain", "shiny", "soft"):
+        assert word in for_whom, word
+    assert [line.split()[0] for line in commands(ROOT / "README.md", "tracking3d")][:2] == ["pick", "run"]
+
+
+def test_the_readme_installs_without_gigabytes_that_nobody_needs():
+    [install, *_] = commands(ROOT / "README.md", "pip")
+    assert "whl/cpu" in install
+
+
+def test_figures_of_the_readme_say_when_they_were_measured():
+    figures = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Figures\n")[2]
+    lines = [line for line in figures.partition("\n## ")[0].splitlines() if line.startswith("- ")]
+    assert lines and all(re.match(r"- \*\*.+\*\* \(\d{4}-\d\d-\d\d\): ", line) for line in lines)
+    assert len(figures.partition("\n## ")[0].split()) < 250
+
+
+def test_tables_of_the_benchmark_say_of_which_version_they_are():
+    sections = (ROOT / "docs/benchmark.md").read_text(encoding="utf-8").split("\n## ")
+    measured = [section for section in sections if "\n|---" in section]
+    assert measured
+    for section in measured:
+        assert re.search(r"revision [0-9a-f]{7}, \d{4}-\d\d-\d\d", section), section.partition("\n")[0]
+
+
+def test_there_is_a_page_for_who_is_lost():
+    page = (ROOT / "docs/when-it-is-lost.md").read_text(encoding="utf-8")
+    for subject in (
+        "A moving camera",
+        "Grey pictures",
+        "One camera only",
+        "Light that stays with the camera",
+    ):
+        assert re.search(rf"^- \*\*{subject}\*\*", page, re.M), subject
+    for file in ("README.md", "docs/index.md", "docs/getting-started.md"):
+        assert "when-it-is-lost.md" in (ROOT / file).read_text(encoding="utf-8"), file
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("KV-Tracker", "https://github.com/Marwan99/kv_tracker"),
+        ("ProxyPose", "https://github.com/ruihangzhang97/proxypose"),
+        ("OnlineSplatter", "https://arxiv.org/abs/2510.20605"),
+        ("a turntable", "https://github.com/alicevision/AliceVision/pull/1943"),
+        ("the two sides of an object", "https://github.com/alicevision/AliceVision/pull/1944"),
+    ],
+)
+def test_alternatives_name_what_others_have_and_where_they_say_so(name, source):
+    page = (ROOT / "docs/alternatives.md").read_text(encoding="utf-8")
+    assert f"[{name}]({source}" in page
 
 
 def test_every_page_is_in_the_index():

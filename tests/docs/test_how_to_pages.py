@@ -60,7 +60,7 @@ def film(clip, path: Path) -> None:
 
 def test_every_page_has_commands_and_says_what_comes_out():
     assert [page.stem for page in HOW_TO] == [
-        "composite", "known-object", "many-videos", "robot-arm", "scan", "splat",
+        "composite", "known-object", "robot-arm", "scan", "splat",
     ]  # fmt: skip
     for page in HOW_TO:
         lines = commands(page, "tracking3d")

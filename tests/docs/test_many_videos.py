@@ -1,4 +1,4 @@
-"""The tables of docs/many-videos.md are what the program makes of the numbers beside them."""
+"""The tables of history/pages/many-videos.md are what the program makes of the numbers beside them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from documentation_pages import ROOT, blocks
 from fleet_report import compared, markdown
 from fleet_simulation import Fleet, Splitting, skewed_lengths
 
-PAGE = ROOT / "docs/many-videos.md"
+PAGE = ROOT / "history/pages/many-videos.md"
 
 
 def test_the_costs_are_those_of_the_stated_figures(capsys):
     for block in blocks(PAGE, "python"):
-        exec(compile(block, "docs/many-videos.md", "exec"), {})
+        exec(compile(block, "history/pages/many-videos.md", "exec"), {})
     printed = capsys.readouterr().out.strip()
     assert printed.count("\n") == 5
     assert printed in PAGE.read_text(encoding="utf-8")

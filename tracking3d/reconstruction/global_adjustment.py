@@ -1,4 +1,4 @@
-"""Poses, lens and surface put right by points, once all frames of a video have been looked at again.
+"""Poses, lens and surface adjusted together by tracked points, once all frames of a video have been refined.
 
 The final refinement gives a pose to every frame by what is rendered there, through a surface that is a few percent off.
 Points that the images follow over many views have no such bias (`tracking3d.points`). Some of the frames, spread over

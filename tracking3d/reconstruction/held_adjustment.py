@@ -1,4 +1,4 @@
-"""Poses of some frames put right by landmarks of frames whose refined poses stand.
+"""Poses of some frames adjusted to landmarks of frames that keep their refined poses.
 
 `tracking3d.reconstruction.global_adjustment` moves all poses, the lens and the surface together. If most of a video was
 refined before, lens and surface are known, and each other frame is resected from the frames that show the same side.

@@ -47,7 +47,7 @@ class DepthMap:
         view: The view.
         depth: ``(S, S)`` float32 z in camera coordinates, NaN where nothing is known.
         score: ``(S, S)`` float32 correlation there.
-        stride: Depths are known at every so manyeth pixel of a row, and row, at most.
+        stride: Spacing, in pixels, of the grid at which depths are estimated; at most.
     """
 
     view: ShapeView
@@ -106,7 +106,7 @@ def depth_maps(
 
 
 def _stride(references: Sequence[ShapeView]) -> int:
-    """Every so manyeth pixel of a row, and row, is asked: enough for the grid, and not all of a large view."""
+    """Spacing of the pixels that are sampled: enough for the grid, and not all of a large view."""
     largest = max((int(view.mask.sum()) for view in references), default=0)
     return max(2, round(np.sqrt(largest / MOST_PIXELS)))
 

@@ -58,9 +58,9 @@ class RunReader:
 
     Args:
         folder: The run folder.
-        refined: Whether frames, masks and mesh are those of the final refinement, if there is one; else all are causal.
-        whole: Whether a run is refused whose scaling, or the taking over of whose correction, was interrupted: its
-            files are of two units, or of two runs.
+        refined: Whether frames, masks and mesh are those of the final refinement, if there is one, or all causal.
+        whole: Whether a run is refused whose scaling, or the taking over of whose correction, was interrupted, so that
+            its files are of two units, or of two runs.
 
     Raises:
         InputError: If it is not a run folder, or not whole.

@@ -179,7 +179,7 @@ def _background_flow(scene: FrameWindow, H: Matrix, step: int = 1) -> NDArray[np
 
 
 def _carry_through(size: int, through: Matrix, step: int = 1) -> Matrix:
-    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every so many of a window's pixels, homogeneous."""
+    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every n-th of a window's pixels, homogeneous."""
     at = np.arange(0.0, size, step)
     by_u, by_v, first = through.T
     return np.asarray(at[:, None] * by_u + at[:, None, None] * by_v + first)

@@ -139,7 +139,7 @@ def align_submaps(
 def by_lens(
     state: SolverState, records: Sequence[FrameRecord], camera: Camera
 ) -> tuple[SolverState, list[FrameRecord]]:
-    """A part's knowledge and estimates as another lens would have them."""
+    """A part's map and estimates under another focal length."""
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     seen = []
     for record in records:

@@ -23,7 +23,7 @@ _RATE = 12.0  # frames a second that are looked at, at least
 _MOST_STRIDE = 4
 _BORDER = 2  # pixels
 _LOOKING = PluginChoice(name="flow", segmentation_size=128)
-"""Cheaper than `csrt` by far, and uncorrected it follows longer; docs/many-videos.md has the figures."""
+"""Cheaper than `csrt` by far, and uncorrected it follows longer; history/pages/many-videos.md has figures."""
 
 
 def tracker_for_looking(own: PluginChoice) -> PluginChoice:

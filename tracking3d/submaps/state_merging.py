@@ -23,7 +23,7 @@ from tracking3d.geometry.similarity import Similarity
 
 
 def through_lens(state: SolverState, camera: Camera) -> SolverState:
-    """A belief as another lens would have it: depths go with the focal length, the object's size stays."""
+    """The state under another focal length: depths scale with it, the object's size stays."""
     before = state.camera
     if camera == before:
         return state

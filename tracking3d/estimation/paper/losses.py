@@ -77,7 +77,7 @@ def _inner(a: Tensor, b: Tensor) -> Tensor:
 
 def erode(silhouette: Tensor) -> Tensor:
     """3 x 3 erosion, as the reference applies it to the soft silhouette ``(B, H, W)``."""
-    # A minimum filter; with its gradient, kornia's erosion takes four to fourteen times as long (docs/kornia.md).
+    # A minimum filter; with its gradient, kornia takes four to fourteen times as long: history/pages/kornia.md.
     return -functional.max_pool2d(-silhouette[:, None], 3, 1, 1)[:, 0]
 
 

@@ -355,7 +355,7 @@ byId("number").addEventListener("change", (event) => goTo(Number(event.target.va
 
 // ---- settings of the run ----
 
-const UNCHOSEN = { quality: "not given", fov: "degrees, upright", intrinsics: "fx, fy, cx, cy" };
+const UNCHOSEN = { quality: "not given", fov: "vertical, degrees", intrinsics: "fx, fy, cx, cy" };
 let settled = Promise.resolve(); // the last change of settings has arrived
 
 function offerSettings() {

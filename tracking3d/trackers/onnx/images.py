@@ -21,10 +21,7 @@ TRIAL_IMAGE[112:144, 112:144] = 255, 120, 20
 class Letterbox:
     """How an image lies in a network's input.
 
-    Attributes:
-        image: Height and width of the image.
-        content: Height and width that the image takes in the input, from its upper left corner.
-        input: Height and width of the input.
+    All sizes are height and width; ``content`` is what the image takes in the input, from its upper left corner.
     """
 
     image: tuple[int, int]

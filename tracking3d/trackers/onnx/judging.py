@@ -26,15 +26,10 @@ _HOLE = 1.3  # log-odds: clearer than this, a part of the mask is what surrounds
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is thought of one proposal.
+    """What is thought of one proposal."""
 
-    Attributes:
-        proposal: The proposal, sharpened by colours.
-        judgement: What colours and the box say of it.
-    """
-
-    proposal: Proposal
-    judgement: Judgement
+    proposal: Proposal  # sharpened by colours
+    judgement: Judgement  # of colours and the box
 
     @property
     def score(self) -> float:

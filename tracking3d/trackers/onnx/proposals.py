@@ -13,17 +13,11 @@ from tracking3d.frames import Box, Image
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A mask that a network proposes.
+    """A mask that a network proposes."""
 
-    Attributes:
-        mask: ``(H, W)`` float32 in [0, 1].
-        sharpness: How little the mask depends on the threshold, in [0, 1], see `sharpness`.
-        origin: Which crop or prompt it came from.
-    """
-
-    mask: NDArray[np.float32]
-    sharpness: float
-    origin: str
+    mask: NDArray[np.float32]  # (H, W) in [0, 1]
+    sharpness: float  # how little the mask depends on the threshold, in [0, 1], see `sharpness`
+    origin: str  # which crop or prompt it came from
 
 
 class Segmenter(Protocol):

@@ -24,7 +24,7 @@ class NetworkCue:
     """Log-odds of the network, see `tracking3d.trackers.segmentation.PixelClassifier`.
 
     A mask that loses a part of the object loses it for good if the next prompt is its box. So the prompt is a box that
-    moves as the mask does, takes up at once what the mask gains, and gives up slowly what the mask loses.
+    follows the mask: it grows immediately, and shrinks slowly.
 
     Args:
         network: The network.

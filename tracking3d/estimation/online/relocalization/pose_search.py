@@ -30,7 +30,7 @@ ROTATION_SEARCH = "rotation_search"
 """The name of the hypothesis that is the best of many rotations around the predicted pose."""
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
-_RETRY_INTERVAL = 5  # frames after a loss with a search in each; later, only every so many frames
+_RETRY_INTERVAL = 5  # frames after a loss with a search in each; later, only every n-th frame
 _MAX_ALIGNED_KEYFRAMES = 8  # most keyframes whose poses are tried for a lost object
 
 

@@ -168,8 +168,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 
     Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
-    of the suite ``fresh`` of seed 9101, and its intercept to further suites and real clips; docs/method/confidence.md
-    has its calibration on others.
+    of the suite ``fresh`` of seed 9101, and its intercept to further suites and real clips;
+    history/pages/method/confidence.md has its calibration on others.
     """
     return 1 / (1 + math.exp(-_INTERCEPT - sum(_log_odds(fit, evidence).values())))
 
@@ -236,7 +236,7 @@ def assess_pose(
     if astray and few and confidence < TRACKED_CONFIDENCE:
         status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
-            status, "after the loss, what was found may be another object", min(confidence, _OUTLINE_ONLY)
+            status, "found again after a loss; could be a different object", min(confidence, _OUTLINE_ONLY)
         )
     if far:
         reason = f"the points fit, the appearance does not (loss {fit.appearance:.2f})"
