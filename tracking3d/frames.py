@@ -84,7 +84,7 @@ class MaskEstimate:
         score: The tracker's own confidence in [0, 1].
         reason: Why there is no mask, or why the score is low; one short clause.
         occluder: ``(H, W)`` bool, what is in front of the object or beside it, such as a hand: neither object nor
-            background. None where the tracker cannot tell.
+            background. None where the tracker cannot tell; the network of `segment` is then asked.
     """
 
     mask: NDArray[np.float32] | None

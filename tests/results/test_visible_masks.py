@@ -53,8 +53,9 @@ def test_visible_masks_are_the_masks_without_the_occluder(folder):
     np.testing.assert_array_equal(read_mask(layout.visible_mask_path(folder, 1)), MASK)
 
 
-def test_of_a_tracker_that_cannot_tell_there_are_none(folder):
-    write_initial_mask(folder, 0, MASK, None)
+@pytest.mark.parametrize("occluder", [None, HAND & False])
+def test_if_nothing_is_ever_in_front_there_are_none(folder, occluder):
+    write_initial_mask(folder, 0, MASK, occluder)
     write_mask(layout.mask_path(folder, 0), MASK)
     write_visible_masks(folder)
     assert not (folder / layout.VISIBLE_MASKS).exists()

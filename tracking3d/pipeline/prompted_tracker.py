@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,11 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.results.records import mask_iou_or_none
+from tracking3d.runtime.stage_times import in_stage
 from tracking3d.trackers.crops import box_of
+
+if TYPE_CHECKING:
+    from tracking3d.trackers.segment.network import ObjectNetwork
 
 _NOTHING = MaskEstimate(None, 0.0, "the object has not been prompted yet")
 
@@ -26,6 +32,8 @@ class PromptedTracker:
     Frames that come from before the first one are tracked backwards from it: the tracker is then started once more
     on the first frame. If a frame has a prompt of its own, the tracker is set on that: re-anchored if it can be
     and still is on the object, since what it has learnt is worth keeping; else started again.
+
+    Of a tracker that cannot tell, the network of `segment` is asked what is in front of the object.
 
     Without a prompt, a tracker that knows no mask by itself waits until the object is prompted: the solver,
     that has found it, by `correct`, or the user. Until then it estimates nothing.
@@ -55,7 +63,11 @@ class PromptedTracker:
             PluginError: If the tracker fails.
         """
         self._first = frame
-        return _NOTHING if self.waits else self._tracker.init(frame, self._first_prompt)
+        return (
+            _NOTHING
+            if self.waits
+            else self._with_occluder(frame, self._tracker.init(frame, self._first_prompt))
+        )
 
     def step(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
         """Estimate for the next frame; with a prompt, which says what the object is in it, by that.
@@ -65,12 +77,26 @@ class PromptedTracker:
         """
         assert self._first is not None
         if self.waits:
-            return _NOTHING if prompt is None else self._start_on(frame, prompt)
+            return _NOTHING if prompt is None else self._with_occluder(frame, self._start_on(frame, prompt))
         if frame.index < self._first.index and not self._backwards:
             self._backwards = True
             self._restart()
             self._tracker.init(self._first, self._first_prompt)
-        return self._tracker.step(frame) if prompt is None else self._correct_by(frame, prompt)
+        estimate = self._tracker.step(frame) if prompt is None else self._correct_by(frame, prompt)
+        return self._with_occluder(frame, estimate)
+
+    def _with_occluder(self, frame: Frame, estimate: MaskEstimate) -> MaskEstimate:
+        """The estimate with what is in front of the object; of a tracker that cannot tell, the network says it."""
+        if estimate.occluder is not None or (mask := estimate.found) is None:
+            return estimate
+        with in_stage("track"):
+            return replace(estimate, occluder=self._network.occluder(frame.image, mask))
+
+    @cached_property
+    def _network(self) -> ObjectNetwork:
+        from tracking3d.trackers.segment.network import ObjectNetwork  # slow to import
+
+        return ObjectNetwork()
 
     def announce(self, coming: Frame | None) -> None:
         """Let the tracker begin with the frame that it is asked for next, see `GuardedTracker.announce`.

@@ -33,7 +33,7 @@ def write_initial_mask(
         OutputError: If it cannot be written.
     """
     levels = np.where(mask, np.uint8(_OBJECT), np.uint8(0))
-    if occluder is not None:
+    if occluder is not None and occluder.any():
         levels[occluder & ~mask] = OCCLUDER
         expect_visible_masks(folder)
     write_image(layout.initial_mask_path(folder, index), levels)

@@ -33,6 +33,9 @@ class BackgroundMemory:
     Args:
         image: ``(H, W, 3)`` RGB, the first frame.
         beside: ``(H, W)`` pixels that are certainly background.
+
+    Attributes:
+        stands_still: Whether the camera has not moved so far.
     """
 
     def __init__(self, image: Image, beside: NDArray[np.bool_]) -> None:
@@ -41,7 +44,7 @@ class BackgroundMemory:
         self._variance = np.full((height, width), _NOISE**2, np.float32)
         self._frames = beside.astype(np.float32)
         self._proven = beside.astype(np.float32)
-        self._stands_still = True
+        self.stands_still = True
         self._latest: tuple[Image, Window, NDArray[np.float32]] | None = None  # what `change` has found
 
     def move(self, present_to_last: NDArray[np.float64], last: Window, present: Window) -> None:
@@ -58,7 +61,7 @@ class BackgroundMemory:
         corners = np.array([sides], np.float64)
         if np.abs(cv2.perspectiveTransform(corners, matrix) - corners).max() < _STILL:
             return
-        self._stands_still = False
+        self.stands_still = False
         height, width = self._frames.shape
         self._mean, self._variance, self._frames, self._proven = (
             cv2.warpPerspective(one, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
@@ -67,7 +70,7 @@ class BackgroundMemory:
 
     def lose(self) -> None:
         """The camera is not followed in this frame; all is forgotten but of one that has stood still so far."""
-        if not self._stands_still:
+        if not self.stands_still:
             self._frames[:] = 0
 
     def change(self, image: Image, window: Window) -> NDArray[np.float32]:
@@ -86,7 +89,7 @@ class BackgroundMemory:
         self._latest = image, window, difference
         changed = np.clip(difference / _CHANGED - 1, -1, 1)
         known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1)) * self._proven[here]
-        if not self._stands_still:  # what lies at another depth changes as the camera moves
+        if not self.stands_still:  # what lies at another depth changes as the camera moves
             changed = np.minimum(changed, 0)
         cue[within] = known * np.where(changed < 0, _UNCHANGED_WEIGHT * changed, changed)
         return cv2.resize(cue, (window.size, window.size), interpolation=_interpolation(window))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,18 +46,26 @@ _SEPARATING = (
 )  # median log-ratio of the object's colours, at most 3, from and up to which they are favoured
 _FAR = 0.3  # of the root of the area: what is further from the mask is background
 _PARTED = 3.0  # pixels by which something moved as the background does rather than with the object, to be it
+_STILL = (24.0, 6.0)
+"""Times what an unchanged and a changed pixel count before a camera that stands still, if a network says what else
+comes before it: with the weight of `segment` 6 log-odds, as in a search, and 3, as much as colours can say (chosen)."""
+_PATCH = (5, 5)
+_SURELY = -0.4  # mean change in a patch, -0.5 at least, below which it shows the background (chosen)
 _FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found after it was out of sight
 
 _Answer = tuple[NDArray[np.float32], Judgement]
 
 
 class PixelClassifier(Protocol):
-    """Says which pixels of a crop are the object."""
+    """Says which pixels of a crop are the object, and which are in front of it."""
 
     def log_odds(
         self, image: Image, present: FrameCrop, motion: MaskMotion, colours: GlobalColours, last: Box
-    ) -> NDArray[np.float32]:
-        """``(S, S)`` log-odds of the object in the crop ``present`` of ``image``; ``last`` was its last mask's box."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """``(S, S)`` log-odds of the object and of an occluder in the crop ``present`` of ``image``.
+
+        ``last`` was the box of the object's last mask.
+        """
         ...
 
 
@@ -156,15 +165,18 @@ class ColourSegmentation:
 
         cues = self._weigh(present, moved)
         evidence = colour_and_motion(last, present, self._colours, self._palette, motion, cues)
-        if self._cues.background:
-            if motion.background is None:
-                self._background.lose()
-            else:
-                self._background.move(motion.background, before, present.window)
-            evidence += self._cues.background * self._background.change(image, present.window)
+        change = self._change(image, motion, before, present)
         if self._network is not None:
-            said = self._network.log_odds(image, present, motion, self._colours, box)
+            said, occluder = self._network.log_odds(image, present, motion, self._colours, box)
             evidence += cues.network * said
+            if self._background.stands_still:
+                moved &= cv2.blur(change, _PATCH) > _SURELY
+                area = np.count_nonzero(moved)
+                if area < _LEAST_PART * self._usual_area * present.window.scale**2:
+                    return _out_of_sight(image)
+                unchanged, changed = _STILL
+                change = np.where(change < 0, unchanged, np.where(occluder > 0, 1, changed)) * change
+        evidence += self._cues.background * change
         if tracked_box is not None:
             evidence -= self._cues.box * distance_beyond(tracked_box, present.window)
         mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
@@ -189,6 +201,18 @@ class ColourSegmentation:
         )
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
         return full, Judgement(separation, margin, agreement, believed)
+
+    def _change(
+        self, image: Image, motion: MaskMotion, before: Window, present: FrameCrop
+    ) -> NDArray[np.float32]:
+        """``(S, S)`` whether pixels have changed against the background, see `BackgroundMemory.change`."""
+        if not self._cues.background:
+            return np.zeros_like(motion.cue)
+        if motion.background is None:
+            self._background.lose()
+        else:
+            self._background.move(motion.background, before, present.window)
+        return self._background.change(image, present.window)
 
     def _weigh(self, present: FrameCrop, moved: NDArray[np.bool_]) -> Cues:
         """The cues' weights in a frame: a network knows less than colours that are the object's alone."""

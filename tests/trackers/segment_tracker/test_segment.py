@@ -12,6 +12,7 @@ from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, Prompt
+from tracking3d.results.files import read_mask
 from tracking3d.testing import check_tracker
 from tracking3d.testing.clips import moving_disc
 from tracking3d.trackers.crops import box_of
@@ -21,6 +22,7 @@ from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
 from tracking3d.trackers.segment.cue import NetworkCue, _settle
 from tracking3d.trackers.segment.network import ObjectNetwork
 from tracking3d.trackers.segment.tracker import SegmentTracker
+from tracking3d.video.image_file import read_image
 
 
 def tracker(**options: object) -> SegmentTracker:
@@ -172,6 +174,30 @@ def test_what_is_in_front_comes_with_the_mask_and_only_once():
     assert estimate.occluder[:, :middle].any() and not estimate.occluder[:, middle + 8 :].any()
     assert beside.sum() < 0.1 * clip.mask.sum()
     assert segment._state.cue.take_occluder(clip.frames[1].image.shape) is None
+
+
+def test_what_is_in_front_of_a_given_mask_leaves_it_whole_and_no_gap_beside_it():
+    clip = moving_disc((120, 160), 1)
+
+    class Hand(ObjectNetwork):
+        def _run(self, crops):
+            logits = np.full((len(crops), 2, 160, 160), -4, np.float32)
+            logits[:, 1, :, 120:] = 4
+            return logits
+
+    occluder = Hand().occluder(clip.frames[0].image, clip.mask)
+    assert not (occluder & clip.mask).any() and occluder.any()
+    assert not Hand().occluder(clip.frames[0].image, clip.mask & False).any()
+
+
+def test_a_hand_that_holds_a_cube_is_in_front_of_it_and_nothing_is_in_front_of_a_car(shared_data: Path):
+    def share(clip: str) -> float:
+        image = read_image(shared_data / clip / "frames" / "000000.jpg")
+        mask = read_mask(shared_data / clip / "masks" / "000000.png")
+        return ObjectNetwork().occluder(image, mask).sum() / mask.sum()
+
+    assert share("cube_in_hand") > 0.1
+    assert share("car_shadow") < 0.02
 
 
 def test_a_box_outside_and_a_frame_before_the_start_are_refused():

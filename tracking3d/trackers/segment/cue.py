@@ -38,8 +38,8 @@ class NetworkCue:
 
     def log_odds(
         self, image: Image, present: FrameCrop, motion: MaskMotion, colours: GlobalColours, last: Box
-    ) -> Map:
-        """``(S, S)`` log-odds within [-4, 4] of the object in the crop ``present`` of ``image``.
+    ) -> tuple[Map, Map]:
+        """``(S, S)`` log-odds within [-4, 4] of the object, and of an occluder, in the crop ``present`` of ``image``.
 
         Args:
             image: ``(H, W, 3)`` RGB.
@@ -57,7 +57,7 @@ class NetworkCue:
             image, carried, motion.cue, present.window, colours, prompt
         )
         self._occluder = occluder, present.window
-        return (_BY_MASK * by_mask + (1 - _BY_MASK) * by_box).astype(np.float32)
+        return (_BY_MASK * by_mask + (1 - _BY_MASK) * by_box).astype(np.float32), occluder
 
     def take_occluder(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """``(H, W)``, what is in front of the object in the frame of ``shape`` that was asked about last.

@@ -18,7 +18,7 @@ from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
 from tracking3d.trackers.colour_models import GlobalColours
-from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.crops import box_of, clip_box, crop_window
 from tracking3d.trackers.cues import FrameCrop
 
 Map = NDArray[np.float32]
@@ -32,6 +32,10 @@ _MASK, _COLOURS, _MOTION, _IS_BOX, _HAS_COLOURS = range(3, _CHANNELS)
 _MARGIN = 0.2  # free space around the box, as in training
 _COLOUR_SCALE, _MOTION_SCALE = 3.0, 2.0  # divisors of the log-odds of colours and of the motion cue
 _MOST = 4.0  # log-odds; beyond its crop there is no object
+
+
+_CLOSE = np.ones((5, 5), np.uint8)
+"""Between the outlines of the mask and of what hides a part of it, two pixels may be left."""
 
 
 class ObjectNetwork:
@@ -120,9 +124,34 @@ class ObjectNetwork:
         )
         return objects[0], objects[1], np.asarray((occluders[0] + occluders[1]) / 2, np.float32)
 
+    def occluder(self, image: Image, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """What is in front of an object or beside it, such as a hand, by one image and the object's mask.
+
+        Args:
+            image: ``(H, W, 3)`` RGB.
+            mask: ``(H, W)``, the object; not empty.
+
+        Returns:
+            ``(H, W)``, without the object.
+        """
+        box = box_of(mask)
+        if box is None:
+            return np.zeros_like(mask)
+        window = Window.around(box, _MARGIN, SIZE)
+        crop = FrameCrop.of(image, window)
+        by_mask, by_box = _image_channels(crop), _box_channels(crop, box)
+        by_mask[_MASK] = crop_window(mask.astype(np.float32), window)
+        logits = self._run(np.stack([by_mask, by_box]))[:, 1].mean(0)
+        return beside_mask(_paste_logits(logits, window, image.shape) > 0, mask)
+
     def _run(self, crops: NDArray[np.float32]) -> NDArray[np.float32]:
         """``(B, 8, S, S)`` to logits ``(B, 2, S, S)``: the visible object, and what is in front of it."""
         return self._network.run({"crop": np.ascontiguousarray(crops)})["logits"]
+
+
+def beside_mask(occluder: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(H, W)``: what the mask takes is the object, and what is close beside an occluder belongs to that."""
+    return (cv2.dilate(occluder.astype(np.uint8), _CLOSE) > 0) & ~mask
 
 
 def _image_channels(crop: FrameCrop) -> NDArray[np.float32]:

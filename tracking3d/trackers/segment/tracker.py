@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
@@ -21,7 +20,7 @@ from tracking3d.trackers.lookahead import Lookahead
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segment.cue import NetworkCue
-from tracking3d.trackers.segment.network import ObjectNetwork
+from tracking3d.trackers.segment.network import ObjectNetwork, beside_mask
 from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 _CUES = Cues(
@@ -31,9 +30,6 @@ _CUES = Cues(
 )  # fmt: skip
 _FIRST_MARGINS = (0.125, 0.2, 0.3)
 """Free space around the box in the crops of the first frame, in which time does not matter."""
-
-_CLOSE = np.ones((5, 5), np.uint8)
-"""Between the outlines of the mask and of what hides a part of it, two pixels may be left."""
 
 
 class SegmentTracker:
@@ -143,8 +139,6 @@ def _step_copy(state: _TrackerState, image: Image) -> tuple[_TrackerState, MaskE
 
 
 def _with_occluder(estimate: MaskEstimate, occluder: NDArray[np.bool_] | None) -> MaskEstimate:
-    """What the mask takes is the object, whatever the network says; what is close beside an occluder belongs to it."""
     if occluder is None or estimate.binary is None:
         return estimate
-    reached = cv2.dilate(occluder.astype(np.uint8), _CLOSE) > 0
-    return replace(estimate, occluder=reached & ~estimate.binary)
+    return replace(estimate, occluder=beside_mask(occluder, estimate.binary))
