@@ -1,0 +1,303 @@
+"""Structure from motion of an object alone, from photos that are taken from far apart and in any order.
+
+Points that are followed from frame to frame do not last through steps of 10 degrees and more, as of photos on a
+turntable. Keypoints that are matched do. Two photos do not tell the turn between them while the lens is not known;
+three do (`structure_hypotheses`, under several lenses). To these the others are added one by one, each by the pose of
+the points that it shares (PnP), and all is adjusted together with the focal length (Snavely et al., "Photo tourism",
+2006). Several pairings of the photos compete, since an object may look alike from two sides.
+
+Whether the outcome is believed is told by what was not fitted: the same outlines carved from all photos must fill the
+mask of each, a photo must show points that face it, and the reversal in depth must fit clearly worse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.reprojection import FloatArray, transform_to_camera
+from tracking3d.bundle_adjustment.reversal import reversal_of
+from tracking3d.estimation.online.initialization.photo_tracks import (
+    Pair,
+    Photo,
+    join_tracks,
+    match_photos,
+    neighbouring_pairs,
+)
+from tracking3d.estimation.online.initialization.registration import subset_of
+from tracking3d.estimation.online.initialization.structure_from_motion import (
+    image_deformation,
+    structure_hypotheses,
+)
+from tracking3d.estimation.online.optimization.pnp import pose_from_points
+from tracking3d.geometry.camera import Camera
+
+MOST_PHOTOS = 60
+"""Photos that are joined at once (chosen: all pairs of them are matched in a minute)."""
+_NEIGHBOURS = 2  # places within which photos are neighbours (measured: the pot and the car)
+_FIELDS_OF_VIEW = (45.0, 27.0, 65.0, 16.0)  # degrees, vertical, of the lenses that are tried
+_THRESHOLD, _LEAST_THRESHOLD = 0.006, 1.0  # largest residual as a share of the object's length, and in pixels
+_COMMON, _COMMON_IN_ALL = 10, 8  # points that two and all three of three photos share at least
+_TRIPLES, _MOST_TRIPLES, _STRUCTURES = 3, 150, 3  # threes of photos that are tried and looked at; structures of each
+_ENOUGH_POINTS, _ENOUGH_DEFORMATION = 60, 0.3  # of three photos, from which more makes no better start
+_SEED_PHOTOS, _GROWN = 6, 4  # photos up to which every start grows, and how many of the starts grow on
+_LEAST_POINTS, _LEAST_SHARE = 8, 0.3  # points that add a photo, and their share of those that it shares
+_AGAIN = 1.3  # times as many points for another attempt
+_LEAST_ANGLE = 2.0  # degrees between the rays of a point
+_FOCAL_PHOTOS = 4  # from which the focal length is free
+_RADIUS = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoStructure:
+    """Photos that were joined, and the points that they share.
+
+    Attributes:
+        photos: Places of the joined photos, in the order in which they were joined.
+        R: ``(F, 3, 3)`` and
+        t: ``(F, 3)`` the pose of every photo; only those of joined ones mean anything.
+        points: ``(N, 3)``; nan for those that are not known.
+        seen: ``(F, N)`` the observations that fit.
+        K: ``(3, 3)``.
+        cost: Mean Cauchy loss of the observations.
+    """
+
+    photos: tuple[int, ...]
+    R: FloatArray
+    t: FloatArray
+    points: FloatArray
+    seen: NDArray[np.bool_]
+    K: FloatArray
+    cost: float = math.inf
+
+    @property
+    def order(self) -> NDArray[np.intp]:
+        """`photos` as indices."""
+        return np.array(self.photos, np.intp)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """``(N,)`` points that are known."""
+        return np.asarray(np.isfinite(self.points).all(1))
+
+    @property
+    def observations(self) -> NDArray[np.bool_]:
+        """``(F, N)`` of known points in joined photos."""
+        joined = np.zeros((len(self.R), 1), bool)
+        joined[self.order] = True
+        return self.seen & joined & self.known
+
+    @property
+    def support(self) -> float:
+        """How many observations fit, and how well."""
+        return float(np.count_nonzero(self.observations) * math.exp(-self.cost))
+
+
+def triangulate(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+    """Add the points that two or more joined photos show from directions apart, and that fit all of them."""
+    order = found.order
+    seen = found.seen[order] & ~found.known
+    new = np.flatnonzero(seen.sum(0) >= 2)
+    if not len(new):
+        return found
+    seen, pixels = seen[:, new], np.nan_to_num(tracks.pixels[np.ix_(order, new)])
+    P = found.K @ np.concatenate([found.R[order], found.t[order][..., None]], 2)
+    rows = pixels[..., None] * P[:, None, None, 2] - P[:, None, :2]
+    rows *= seen[..., None, None] / np.linalg.norm(rows, axis=-1, keepdims=True).clip(1e-12)
+    homogeneous = np.linalg.eigh(np.einsum("fnai,fnaj->nij", rows, rows))[1][..., 0]
+    divisor = homogeneous[:, 3:]
+    points = homogeneous[:, :3] / np.where(np.abs(divisor) < 1e-12, np.nan, divisor)
+    projected = np.einsum("fij,nj->fni", P[..., :3], points) + P[:, None, :, 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        residual = np.linalg.norm(projected[..., :2] / projected[..., 2:] - pixels, axis=2)
+        fits = ((projected[..., 2] > 0) & (residual <= 2 * threshold)) | ~seen
+    centres = -np.einsum("fji,fj->fi", found.R[order], found.t[order])
+    rays = points - centres[:, None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    cosine = np.einsum("fni,gni->nfg", np.nan_to_num(rays), np.nan_to_num(rays))
+    both = seen.T[:, :, None] & seen.T[:, None]
+    apart = np.where(both, cosine, 1.0).min((1, 2)) < math.cos(math.radians(_LEAST_ANGLE))
+    good = fits.all(0) & apart & np.isfinite(points).all(1)
+    every = found.points.copy()
+    every[new[good]] = points[good]
+    return replace(found, points=every)
+
+
+def adjust_all(
+    tracks: Tracks, found: PhotoStructure, threshold: float, iterations: int
+) -> PhotoStructure:
+    """Poses, points and focal length adjusted together; observations that do not fit are left out."""
+    order = found.order
+    used = np.flatnonzero(found.known & (found.seen[order].sum(0) >= 2))
+    if len(used) < _LEAST_POINTS:
+        return replace(found, cost=math.inf)
+    at = np.ix_(order, used)
+    solved = adjust(
+        Tracks(tracks.pixels[at], found.seen[at]),
+        found.K,
+        Structure(found.R[order], found.t[order], found.points[used]),
+        scale=threshold / 2,
+        iterations=iterations,
+        free_focal=len(order) >= _FOCAL_PHOTOS,
+    )
+    R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
+    R[order], t[order] = solved.R, solved.t
+    seen[at] &= ~(np.nan_to_num(solved.residual) > 2 * threshold)
+    points = np.full_like(found.points, np.nan)
+    points[used] = np.where(seen[at].sum(0)[:, None] >= 2, solved.points, np.nan)
+    K = found.K * [[solved.focal_factor, 1, 1], [1, solved.focal_factor, 1], [1, 1, 1]]
+    return replace(found, R=R, t=t, points=points, seen=seen, K=K, cost=solved.cost)
+
+
+def add_photo(tracks: Tracks, found: PhotoStructure, photo: int, threshold: float) -> PhotoStructure | None:
+    """Add a photo by the points that it shares; None if too few of them agree on a pose."""
+    shared = np.flatnonzero(tracks.visible[photo] & found.known)
+    points, pixels = found.points[shared], tracks.pixels[photo, shared]
+    pose = pose_from_points(points, pixels, found.K, threshold=1.5 * threshold, seed=0)
+    if pose is None or np.count_nonzero(pose.inliers) < max(_LEAST_POINTS, _LEAST_SHARE * len(shared)):
+        return None
+    if transform_to_camera(pose.R, pose.t, points[pose.inliers])[:, 2].min() <= 0:
+        return None
+    R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
+    R[photo], t[photo] = pose.R, pose.t
+    seen[photo] = tracks.visible[photo]
+    seen[photo, shared[~pose.inliers]] = False
+    return replace(found, photos=(*found.photos, photo), R=R, t=t, seen=seen)
+
+
+def grow(tracks: Tracks, found: PhotoStructure, threshold: float, most: int) -> PhotoStructure:
+    """Add photos one by one, that with most shared points first, until there are ``most`` or none can be added."""
+    failed: dict[int, float] = {}
+    found = adjust_all(tracks, found, threshold, 15)
+    while len(found.photos) < min(most, len(tracks.visible)):
+        found = triangulate(tracks, found, threshold)
+        shared = (tracks.visible & found.known).sum(1)
+        shared[found.order] = 0
+        waiting = [
+            photo
+            for photo in np.argsort(-shared, kind="stable").tolist()
+            if shared[photo] >= max(_LEAST_POINTS, failed.get(photo, 0.0))
+        ]
+        if not waiting:
+            break
+        added = add_photo(tracks, found, waiting[0], threshold)
+        if added is None:
+            failed[waiting[0]] = _AGAIN * shared[waiting[0]] + 2
+        else:
+            found = adjust_all(tracks, triangulate(tracks, added, threshold), threshold, 8)
+    found = triangulate(tracks, found, threshold)
+    for _ in range(2):
+        found = adjust_all(tracks, found, threshold, 25)
+    return found
+
+
+def seeds(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float) -> list[PhotoStructure]:
+    """Structures of three photos each, under each of the lenses ``(3, 3)``."""
+    found = []
+    for photos in _choose_triples(tracks):
+        names = np.flatnonzero(tracks.visible[list(photos)].all(0))
+        part = subset_of(tracks, np.array(photos), names)
+        middle, extent = part.pixels[0].mean(0), float(np.ptp(part.pixels[0], axis=0).max())
+        for K in cameras:
+            depth = 2 * _RADIUS * K[0, 0] / extent
+            t0 = np.array([*((middle - K[:2, 2]) * depth / K[0, 0]), depth])
+            for one in structure_hypotheses(part, K, t0, _RADIUS, scale=threshold / 2, keep=_STRUCTURES):
+                frames, count = tracks.visible.shape
+                R, t, points = np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), np.full((count, 3), np.nan)
+                R[list(photos)], t[list(photos)], points[names] = one.R, one.t, one.points
+                found.append(PhotoStructure(photos, R, t, points, tracks.visible.copy(), K, one.cost))
+    return found
+
+
+def _choose_triples(tracks: Tracks) -> list[tuple[int, int, int]]:
+    """Threes of photos that share many points, whose image changes its form; no two of them share two photos."""
+    common = tracks.visible.astype(int) @ tracks.visible.T.astype(int)
+    shared = []
+    for triple in combinations(range(len(common)), 3):
+        if min(common[a, b] for a, b in combinations(triple, 2)) >= _COMMON:
+            count = int(np.count_nonzero(tracks.visible[list(triple)].all(0)))
+            if count >= _COMMON_IN_ALL:
+                shared.append((count, triple))
+    shared.sort(reverse=True)
+    scored = []
+    for count, triple in shared[:_MOST_TRIPLES]:
+        names = np.flatnonzero(tracks.visible[list(triple)].all(0))
+        deformation = image_deformation(subset_of(tracks, np.array(triple), names))
+        scored.append((min(count, _ENOUGH_POINTS) * min(deformation, _ENOUGH_DEFORMATION), triple))
+    chosen: list[tuple[int, int, int]] = []
+    for _, triple in sorted(scored, key=lambda one: -one[0]):
+        if len(chosen) < _TRIPLES and all(len({*triple} & {*other}) < 2 for other in chosen):
+            chosen.append(triple)
+    return chosen
+
+
+def solve_photos(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float) -> list[PhotoStructure]:
+    """Structures of as many photos as can be joined, each from another start, the best first."""
+    begun = [grow(tracks, seed, threshold, _SEED_PHOTOS) for seed in seeds(tracks, cameras, threshold)]
+    begun = [one for one in begun if math.isfinite(one.cost)]
+    begun.sort(key=lambda one: (-min(len(one.photos), _SEED_PHOTOS), -one.support))
+    grown = [grow(tracks, one, threshold, len(tracks.visible)) for one in begun[:_GROWN]]
+    return sorted(grown, key=lambda one: (-len(one.photos), -one.support))
+
+
+def reverse(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+    """The same photos and points, reversed in depth and adjusted."""
+    order, known = found.order, found.known
+    T = np.tile(np.eye(4), (len(order), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = found.R[order], found.t[order]
+    reversal = reversal_of(found.points[known], T[0])
+    turned = reversal.poses(T)
+    R, t, points = found.R.copy(), found.t.copy(), found.points.copy()
+    R[order], t[order], points[known] = turned[:, :3, :3], turned[:, :3, 3], reversal.points(points[known])
+    return adjust_all(tracks, replace(found, R=R, t=t, points=points), threshold, 40)
+
+
+def facing(found: PhotoStructure) -> float:
+    """How much nearer the points are that a photo shows than the middle of all of them, in their root mean square
+    distance from it; a solution that is reversed in depth shows its far side."""
+    middle = np.nanmean(found.points, axis=0)
+    size = math.sqrt(float(np.nanmean(np.sum((found.points - middle) ** 2, 1))))
+    nearer = [
+        -float(np.mean((found.points[found.observations[photo]] - middle) @ found.R[photo, 2]))
+        for photo in found.photos
+        if found.observations[photo].any()
+    ]
+    return float(np.mean(nearer)) / max(size, 1e-12)
+
+
+_GRID = 40  # cells along a side of the carved grid (chosen)
+_MARGIN = 2.0  # half a side of the grid, in root mean square distances of the points from their middle
+
+
+def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure, margin: float = _MARGIN) -> FloatArray:
+    """``(F,)`` for each joined photo how much of its mask is filled by what all masks leave when they are carved out of a block.
+
+    Poses that are wrong carve away what others show.
+    """
+    middle = np.nanmean(found.points, axis=0)
+    size = math.sqrt(float(np.nanmean(np.sum((found.points - middle) ** 2, 1))))
+    axis = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
+    cells = middle + margin * size * np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    kept = np.zeros(len(cells), int)
+    places = []
+    for photo in found.photos:
+        seen = transform_to_camera(found.R[photo], found.t[photo], cells)
+        pixels = seen[:, :2] / seen[:, 2:] * [found.K[0, 0], found.K[1, 1]] + found.K[:2, 2]
+        silhouette = photos[photo].silhouette
+        places.append(silhouette.places(pixels))
+        kept += silhouette.inside[places[-1][:, 1], places[-1][:, 0]]
+    inside = kept >= len(found.photos) * 0.9
+    filled = []
+    for photo, place in zip(found.photos, places, strict=True):
+        mask = photos[photo].silhouette.inside
+        drawn = np.zeros(mask.shape, np.uint8)
+        drawn[place[inside, 1], place[inside, 0]] = 1
+        filled.append((drawn, mask))
+    return filled
