@@ -77,8 +77,13 @@ def detect(
     return Keypoints(pixel.astype(np.float32), np.asarray(descriptor, dtype=np.float32))
 
 
-def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
+def match(a: Keypoints, b: Keypoints, ratio: float = _RATIO) -> NDArray[np.int64]:
     """Mutual nearest neighbours that pass the ratio test against keypoints elsewhere in ``b``.
+
+    Args:
+        a: Keypoints of one frame.
+        b: Those of another.
+        ratio: The largest ratio of the distances to the match and to the nearest keypoint elsewhere.
 
     Returns:
         ``(K, 2)`` indices into ``a`` and ``b``, each at most once.
@@ -92,7 +97,7 @@ def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
     distance, best = distance[mutual], best[mutual]
     gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
     elsewhere = np.where(gap < _SAME_CORNER, np.inf, distance).min(1)
-    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < _RATIO * elsewhere)
+    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < ratio * elsewhere)
     return np.stack([mutual[clear], best[clear]], 1)
 
 

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -45,14 +46,21 @@ _NEIGHBOURS = 2  # places within which photos are neighbours (measured: the pot 
 _FIELDS_OF_VIEW = (45.0, 27.0, 65.0, 16.0)  # degrees, vertical, of the lenses that are tried
 _THRESHOLD, _LEAST_THRESHOLD = 0.006, 1.0  # largest residual as a share of the object's length, and in pixels
 _COMMON, _COMMON_IN_ALL = 10, 8  # points that two and all three of three photos share at least
-_TRIPLES, _MOST_TRIPLES, _STRUCTURES = 3, 150, 3  # threes of photos that are tried and looked at; structures of each
+_TRIPLES, _MOST_TRIPLES, _STRUCTURES = 6, 150, 3  # threes of photos that are tried and looked at; structures of each
 _ENOUGH_POINTS, _ENOUGH_DEFORMATION = 60, 0.3  # of three photos, from which more makes no better start
-_SEED_PHOTOS, _GROWN = 6, 4  # photos up to which every start grows, and how many of the starts grow on
-_LEAST_POINTS, _LEAST_SHARE = 8, 0.3  # points that add a photo, and their share of those that it shares
+_SEED_PHOTOS, _GROWN = 6, 6  # photos up to which every start grows, and how many of the starts grow on
+_SHARED_POINTS = 5  # known points in a photo from which it can be added
+_LEAST_POINTS, _LEAST_SHARE = 10, 0.5  # observations of an added photo that fit, and their share of those that could
+_LINK_POINTS, _LINK_SHARE = 8, 0.65  # points that two photos share at least, and the share that fits if they agree
+_ROUNDS = 3
 _AGAIN = 1.3  # times as many points for another attempt
 _LEAST_ANGLE = 2.0  # degrees between the rays of a point
 _FOCAL_PHOTOS = 4  # from which the focal length is free
+_SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and 8 degrees
 _RADIUS = 0.9
+# The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
+# points from their middle, share of the photos that must show a cell inside, and pixels that a cell covers (chosen).
+_GRID, _BLOCK, _VOTES, _CELL = 40, 2.5, 0.9, 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +147,12 @@ def adjust_all(
     if len(used) < _LEAST_POINTS:
         return replace(found, cost=math.inf)
     at = np.ix_(order, used)
+    part, start = Tracks(tracks.pixels[at], found.seen[at]), Structure(found.R[order], found.t[order], found.points[used])
     solved = adjust(
-        Tracks(tracks.pixels[at], found.seen[at]),
-        found.K,
-        Structure(found.R[order], found.t[order], found.points[used]),
-        scale=threshold / 2,
-        iterations=iterations,
-        free_focal=len(order) >= _FOCAL_PHOTOS,
+        part, found.K, start, scale=threshold / 2, iterations=iterations, free_focal=len(order) >= _FOCAL_PHOTOS
     )
+    if not _SHORTEST < found.K[1, 1] * solved.focal_factor / found.K[1, 2] < _LONGEST:
+        solved = adjust(part, found.K, start, scale=threshold / 2, iterations=iterations)
     R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
     R[order], t[order] = solved.R, solved.t
     seen[at] &= ~(np.nan_to_num(solved.residual) > 2 * threshold)
@@ -157,19 +163,82 @@ def adjust_all(
 
 
 def add_photo(tracks: Tracks, found: PhotoStructure, photo: int, threshold: float) -> PhotoStructure | None:
-    """Add a photo by the points that it shares; None if too few of them agree on a pose."""
+    """Add a photo by the points that it shares, or by a turn like its neighbours'; None if it does not fit then.
+
+    A pose is kept if most of what the photo shares with the joined ones fits after all are adjusted: points that were
+    known, and those that only it and one other show, which say something of the pose too.
+    """
     shared = np.flatnonzero(tracks.visible[photo] & found.known)
     points, pixels = found.points[shared], tracks.pixels[photo, shared]
-    pose = pose_from_points(points, pixels, found.K, threshold=1.5 * threshold, seed=0)
-    if pose is None or np.count_nonzero(pose.inliers) < max(_LEAST_POINTS, _LEAST_SHARE * len(shared)):
-        return None
-    if transform_to_camera(pose.R, pose.t, points[pose.inliers])[:, 2].min() <= 0:
-        return None
-    R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
-    R[photo], t[photo] = pose.R, pose.t
-    seen[photo] = tracks.visible[photo]
-    seen[photo, shared[~pose.inliers]] = False
-    return replace(found, photos=(*found.photos, photo), R=R, t=t, seen=seen)
+    poses = [pose_from_points(points, pixels, found.K, threshold=1.5 * threshold, seed=0)]
+    for start in _continued_motion(found, photo):
+        poses.append(pose_from_points(points, pixels, found.K, start, threshold=3 * threshold, seed=0))
+    common = tracks.visible[photo] & tracks.visible[found.order].any(0)
+    best, most = None, max(_LEAST_POINTS, _LEAST_SHARE * np.count_nonzero(common))
+    for pose in poses:
+        if pose is None or transform_to_camera(pose.R, pose.t, points)[pose.inliers, 2].min() <= 0:
+            continue
+        R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
+        R[photo], t[photo] = pose.R, pose.t
+        seen[photo] = tracks.visible[photo]
+        added = replace(found, photos=(*found.photos, photo), R=R, t=t, seen=seen)
+        added = adjust_all(tracks, triangulate(tracks, added, threshold), threshold, 8)
+        count = np.count_nonzero(added.observations[photo])
+        if count >= most and photo in _connected(_links(tracks, added)):
+            best, most = added, count
+    return best
+
+
+def _links(tracks: Tracks, found: PhotoStructure) -> NDArray[np.bool_]:
+    """``(F, F)`` which joined photos agree: most of the points that are matched between them fit both."""
+    fits = found.observations
+    joined = fits.any(1)
+    there = (tracks.visible & joined[:, None]).astype(int)
+    common, kept = there @ there.T, fits.astype(int) @ fits.T.astype(int)
+    linked = (common >= _LINK_POINTS) & (kept >= _LINK_SHARE * common)
+    np.fill_diagonal(linked, False)
+    return np.asarray(linked, np.bool_)
+
+
+def _connected(linked: NDArray[np.bool_]) -> set[int]:
+    """The most photos that hang together by threes of which all agree, neighbouring threes sharing two.
+
+    A wrong pose mostly agrees with one neighbour, on which it was based, and not with the next one too.
+    """
+    triples = [t for t in combinations(np.flatnonzero(linked.any(1)).tolist(), 3) if all(linked[a, b] for a, b in combinations(t, 2))]
+    groups: list[tuple[set[int], set[Pair]]] = []
+    for triple in triples:
+        photos, edges = set(triple), set(combinations(triple, 2))
+        apart = []
+        for group in groups:
+            if group[1] & edges:
+                photos, edges = photos | group[0], edges | group[1]
+            else:
+                apart.append(group)
+        groups = [*apart, (photos, edges)]
+    return max((photos for photos, _ in groups), key=len, default=set())
+
+
+def keep_connected(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+    """Without photos that do not agree with the others."""
+    kept = _connected(_links(tracks, found))
+    if len(kept) == len(found.photos) or len(kept) < 3:
+        return found
+    photos = tuple(photo for photo in found.photos if photo in kept)
+    seen = tracks.visible & np.isin(np.arange(len(tracks.visible)), photos)[:, None] & (found.seen | ~found.known)
+    return adjust_all(tracks, replace(found, photos=photos, seen=seen), threshold, 15)
+
+
+def _continued_motion(found: PhotoStructure, photo: int) -> list[tuple[FloatArray, FloatArray]]:
+    """Poses of a photo that turns from its neighbour as far as that does from the next one, on either side."""
+    starts = []
+    count = len(found.R)
+    for side in (-1, 1):
+        near, next_one = (photo + side) % count, (photo + 2 * side) % count
+        if near in found.photos and next_one in found.photos:
+            R = found.R[near] @ found.R[next_one].T
+            starts.append((R @ found.R[near], found.t[near] + R @ (found.t[near] - found.t[next_one])))
+    return starts
 
 
 def grow(tracks: Tracks, found: PhotoStructure, threshold: float, most: int) -> PhotoStructure:
@@ -183,19 +252,19 @@ def grow(tracks: Tracks, found: PhotoStructure, threshold: float, most: int) -> 
         waiting = [
             photo
             for photo in np.argsort(-shared, kind="stable").tolist()
-            if shared[photo] >= max(_LEAST_POINTS, failed.get(photo, 0.0))
+            if shared[photo] >= max(_SHARED_POINTS, failed.get(photo, 0.0))
         ]
         if not waiting:
             break
         added = add_photo(tracks, found, waiting[0], threshold)
         if added is None:
-            failed[waiting[0]] = _AGAIN * shared[waiting[0]] + 2
+            failed[waiting[0]] = _AGAIN * shared[waiting[0]] + 1
         else:
-            found = adjust_all(tracks, triangulate(tracks, added, threshold), threshold, 8)
+            found = added
     found = triangulate(tracks, found, threshold)
     for _ in range(2):
         found = adjust_all(tracks, found, threshold, 25)
-    return found
+    return keep_connected(tracks, found, threshold)
 
 
 def seeds(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float) -> list[PhotoStructure]:
@@ -243,7 +312,14 @@ def solve_photos(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float
     begun = [grow(tracks, seed, threshold, _SEED_PHOTOS) for seed in seeds(tracks, cameras, threshold)]
     begun = [one for one in begun if math.isfinite(one.cost)]
     begun.sort(key=lambda one: (-min(len(one.photos), _SEED_PHOTOS), -one.support))
-    grown = [grow(tracks, one, threshold, len(tracks.visible)) for one in begun[:_GROWN]]
+    grown = []
+    for one in begun[:_GROWN]:
+        for _ in range(_ROUNDS):
+            before = len(one.photos)
+            one = grow(tracks, one, threshold, len(tracks.visible))
+            if len(one.photos) <= before:
+                break
+        grown.append(one)
     return sorted(grown, key=lambda one: (-len(one.photos), -one.support))
 
 
@@ -272,32 +348,28 @@ def facing(found: PhotoStructure) -> float:
     return float(np.mean(nearer)) / max(size, 1e-12)
 
 
-_GRID = 40  # cells along a side of the carved grid (chosen)
-_MARGIN = 2.0  # half a side of the grid, in root mean square distances of the points from their middle
+def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure) -> float:
+    """How much of the masks is filled by what they leave when they are carved out of a block, the mean of all photos.
 
-
-def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure, margin: float = _MARGIN) -> FloatArray:
-    """``(F,)`` for each joined photo how much of its mask is filled by what all masks leave when they are carved out of a block.
-
-    Poses that are wrong carve away what others show.
+    Poses that are wrong carve away what other photos show (silhouette coherence, Hernandez et al. 2007).
     """
     middle = np.nanmean(found.points, axis=0)
     size = math.sqrt(float(np.nanmean(np.sum((found.points - middle) ** 2, 1))))
     axis = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
-    cells = middle + margin * size * np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
-    kept = np.zeros(len(cells), int)
-    places = []
+    cells = middle + _BLOCK * size * np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    places, votes = [], np.zeros(len(cells), int)
     for photo in found.photos:
         seen = transform_to_camera(found.R[photo], found.t[photo], cells)
-        pixels = seen[:, :2] / seen[:, 2:] * [found.K[0, 0], found.K[1, 1]] + found.K[:2, 2]
-        silhouette = photos[photo].silhouette
-        places.append(silhouette.places(pixels))
-        kept += silhouette.inside[places[-1][:, 1], places[-1][:, 0]]
-    inside = kept >= len(found.photos) * 0.9
+        pixels = seen[:, :2] / seen[:, 2:] * found.K[[0, 1], [0, 1]] + found.K[:2, 2]
+        place = photos[photo].silhouette.places(pixels)
+        votes += photos[photo].silhouette.inside[place[:, 1], place[:, 0]]
+        places.append(place)
+    left = votes >= _VOTES * len(found.photos)
     filled = []
     for photo, place in zip(found.photos, places, strict=True):
-        mask = photos[photo].silhouette.inside
-        drawn = np.zeros(mask.shape, np.uint8)
-        drawn[place[inside, 1], place[inside, 0]] = 1
-        filled.append((drawn, mask))
-    return filled
+        inside = photos[photo].silhouette.inside
+        drawn = np.zeros(inside.shape, np.uint8)
+        drawn[place[left, 1], place[left, 0]] = 1
+        drawn = cv2.dilate(drawn, np.ones((_CELL, _CELL), np.uint8))
+        filled.append(float(drawn[inside].mean()))
+    return float(np.mean(filled))

@@ -19,7 +19,8 @@ from tracking3d.bundle_adjustment.adjustment import Tracks
 from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
 
-_KEYPOINTS, _SIZE, _CONTRAST = 500, 400, 0.01  # of a photo, which has few neighbours (measured: the pot and the car)
+# Of a photo, which has few neighbours (measured: 14 of 20 photos of the car are joined, with half as many keypoints 9).
+_KEYPOINTS, _SIZE, _CONTRAST, _RATIO = 1000, 600, 0.005, 0.85
 _STILL = 0.03  # share of the object's length; matches that move by less stand still (measured on the pot)
 _SILHOUETTE_SIZE = 160  # pixels along the longer side of a silhouette (chosen)
 _FEWEST_MATCHES, _LEAST_SHARE = 10, 0.15  # inliers of a pair, and their share of its matches (chosen)
@@ -46,7 +47,9 @@ class KeypointMethod:
 
 
 METHODS: tuple[KeypointMethod, ...] = (
-    KeypointMethod(partial(detect, most=_KEYPOINTS, size=_SIZE, contrast=_CONTRAST), match),
+    KeypointMethod(
+        partial(detect, most=_KEYPOINTS, size=_SIZE, contrast=_CONTRAST), partial(match, ratio=_RATIO)
+    ),
 )
 """The matches of all methods are used together."""
 
