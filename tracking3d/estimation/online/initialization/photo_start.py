@@ -16,16 +16,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial import KDTree
 
 from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.bundle_adjustment.reprojection import FloatArray, transform_to_camera
 from tracking3d.bundle_adjustment.reversal import reversal_of
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.features.sift import Keypoints
+from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.photo_tracks import (
+    SAME_PLACE,
+    Matches,
     Pair,
     Photo,
     join_tracks,
@@ -37,8 +43,14 @@ from tracking3d.estimation.online.initialization.structure_from_motion import (
     image_deformation,
     structure_hypotheses,
 )
+from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.local_mapping import fit_shape
 from tracking3d.estimation.online.optimization.pnp import pose_from_points
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.prototype_start import RADIUS
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import pose_arrays, pose_from_arrays
 
 MOST_PHOTOS = 60
 """Photos that are joined at once (chosen: all pairs of them are matched in a minute)."""
@@ -46,21 +58,59 @@ _NEIGHBOURS = 2  # places within which photos are neighbours (measured: the pot 
 _FIELDS_OF_VIEW = (45.0, 27.0, 65.0, 16.0)  # degrees, vertical, of the lenses that are tried
 _THRESHOLD, _LEAST_THRESHOLD = 0.006, 1.0  # largest residual as a share of the object's length, and in pixels
 _COMMON, _COMMON_IN_ALL = 10, 8  # points that two and all three of three photos share at least
-_TRIPLES, _MOST_TRIPLES, _STRUCTURES = 6, 150, 3  # threes of photos that are tried and looked at; structures of each
+_TRIPLES, _MOST_TRIPLES, _STRUCTURES = (
+    6,
+    150,
+    3,
+)  # threes of photos that are tried and looked at; structures of each
 _ENOUGH_POINTS, _ENOUGH_DEFORMATION = 60, 0.3  # of three photos, from which more makes no better start
 _SEED_PHOTOS, _GROWN = 6, 6  # photos up to which every start grows, and how many of the starts grow on
 _SHARED_POINTS = 5  # known points in a photo from which it can be added
-_LEAST_POINTS, _LEAST_SHARE = 10, 0.5  # observations of an added photo that fit, and their share of those that could
-_LINK_POINTS, _LINK_SHARE = 8, 0.65  # points that two photos share at least, and the share that fits if they agree
+_LEAST_POINTS, _LEAST_SHARE = (
+    10,
+    0.5,
+)  # observations of an added photo that fit, and their share of those that could
+_LINK_POINTS, _LINK_SHARE = (
+    8,
+    0.65,
+)  # points that two photos share at least, and the share that fits if they agree
 _ROUNDS = 3
 _AGAIN = 1.3  # times as many points for another attempt
 _LEAST_ANGLE = 2.0  # degrees between the rays of a point
 _FOCAL_PHOTOS = 4  # from which the focal length is free
 _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and 8 degrees
-_RADIUS = 0.9
+# A structure is believed (measured on seven sets, right ones and wrong ones): most of its cost, the ratio of the costs
+# of its reversal and itself and the facing either of which is evidence enough, and the least share of masks filled.
+_FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.9
+_MANY_SHARED = 25  # matches of neighbours, at the median, from which it is not points that lack (chosen)
 # The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
 # points from their middle, share of the photos that must show a cell inside, and pixels that a cell covers (chosen).
 _GRID, _BLOCK, _VOTES, _CELL = 40, 2.5, 0.9, 9
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoTracks:
+    """The points that photos share, and how they are fitted.
+
+    Attributes:
+        tracks: Points through the photos.
+        threshold: Largest residual of an inlier in pixels.
+        free_focal: Whether the focal length is to be found, too.
+    """
+
+    tracks: Tracks
+    threshold: float
+    free_focal: bool = True
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """``(F, N)`` which photo shows which point."""
+        return self.tracks.visible
+
+    @property
+    def pixels(self) -> FloatArray:
+        """``(F, N, 2)``."""
+        return self.tracks.pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +158,7 @@ class PhotoStructure:
         return float(np.count_nonzero(self.observations) * math.exp(-self.cost))
 
 
-def triangulate(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+def triangulate(tracks: PhotoTracks, found: PhotoStructure) -> PhotoStructure:
     """Add the points that two or more joined photos show from directions apart, and that fit all of them."""
     order = found.order
     seen = found.seen[order] & ~found.known
@@ -125,7 +175,7 @@ def triangulate(tracks: Tracks, found: PhotoStructure, threshold: float) -> Phot
     projected = np.einsum("fij,nj->fni", P[..., :3], points) + P[:, None, :, 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         residual = np.linalg.norm(projected[..., :2] / projected[..., 2:] - pixels, axis=2)
-        fits = ((projected[..., 2] > 0) & (residual <= 2 * threshold)) | ~seen
+        fits = ((projected[..., 2] > 0) & (residual <= 2 * tracks.threshold)) | ~seen
     centres = -np.einsum("fji,fj->fi", found.R[order], found.t[order])
     rays = points - centres[:, None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
@@ -138,31 +188,31 @@ def triangulate(tracks: Tracks, found: PhotoStructure, threshold: float) -> Phot
     return replace(found, points=every)
 
 
-def adjust_all(
-    tracks: Tracks, found: PhotoStructure, threshold: float, iterations: int
-) -> PhotoStructure:
+def adjust_all(tracks: PhotoTracks, found: PhotoStructure, iterations: int) -> PhotoStructure:
     """Poses, points and focal length adjusted together; observations that do not fit are left out."""
     order = found.order
     used = np.flatnonzero(found.known & (found.seen[order].sum(0) >= 2))
     if len(used) < _LEAST_POINTS:
         return replace(found, cost=math.inf)
     at = np.ix_(order, used)
-    part, start = Tracks(tracks.pixels[at], found.seen[at]), Structure(found.R[order], found.t[order], found.points[used])
-    solved = adjust(
-        part, found.K, start, scale=threshold / 2, iterations=iterations, free_focal=len(order) >= _FOCAL_PHOTOS
+    part, start = (
+        Tracks(tracks.pixels[at], found.seen[at]),
+        Structure(found.R[order], found.t[order], found.points[used]),
     )
+    free = tracks.free_focal and len(order) >= _FOCAL_PHOTOS
+    solved = adjust(part, found.K, start, scale=tracks.threshold / 2, iterations=iterations, free_focal=free)
     if not _SHORTEST < found.K[1, 1] * solved.focal_factor / found.K[1, 2] < _LONGEST:
-        solved = adjust(part, found.K, start, scale=threshold / 2, iterations=iterations)
+        solved = adjust(part, found.K, start, scale=tracks.threshold / 2, iterations=iterations)
     R, t, seen = found.R.copy(), found.t.copy(), found.seen.copy()
     R[order], t[order] = solved.R, solved.t
-    seen[at] &= ~(np.nan_to_num(solved.residual) > 2 * threshold)
+    seen[at] &= ~(np.nan_to_num(solved.residual) > 2 * tracks.threshold)
     points = np.full_like(found.points, np.nan)
     points[used] = np.where(seen[at].sum(0)[:, None] >= 2, solved.points, np.nan)
     K = found.K * [[solved.focal_factor, 1, 1], [1, solved.focal_factor, 1], [1, 1, 1]]
     return replace(found, R=R, t=t, points=points, seen=seen, K=K, cost=solved.cost)
 
 
-def add_photo(tracks: Tracks, found: PhotoStructure, photo: int, threshold: float) -> PhotoStructure | None:
+def add_photo(tracks: PhotoTracks, found: PhotoStructure, photo: int) -> PhotoStructure | None:
     """Add a photo by the points that it shares, or by a turn like its neighbours'; None if it does not fit then.
 
     A pose is kept if most of what the photo shares with the joined ones fits after all are adjusted: points that were
@@ -170,9 +220,9 @@ def add_photo(tracks: Tracks, found: PhotoStructure, photo: int, threshold: floa
     """
     shared = np.flatnonzero(tracks.visible[photo] & found.known)
     points, pixels = found.points[shared], tracks.pixels[photo, shared]
-    poses = [pose_from_points(points, pixels, found.K, threshold=1.5 * threshold, seed=0)]
+    poses = [pose_from_points(points, pixels, found.K, threshold=1.5 * tracks.threshold, seed=0)]
     for start in _continued_motion(found, photo):
-        poses.append(pose_from_points(points, pixels, found.K, start, threshold=3 * threshold, seed=0))
+        poses.append(pose_from_points(points, pixels, found.K, start, threshold=3 * tracks.threshold, seed=0))
     common = tracks.visible[photo] & tracks.visible[found.order].any(0)
     best, most = None, max(_LEAST_POINTS, _LEAST_SHARE * np.count_nonzero(common))
     for pose in poses:
@@ -182,14 +232,15 @@ def add_photo(tracks: Tracks, found: PhotoStructure, photo: int, threshold: floa
         R[photo], t[photo] = pose.R, pose.t
         seen[photo] = tracks.visible[photo]
         added = replace(found, photos=(*found.photos, photo), R=R, t=t, seen=seen)
-        added = adjust_all(tracks, triangulate(tracks, added, threshold), threshold, 8)
+        added = adjust_all(tracks, triangulate(tracks, added), 8)
         count = np.count_nonzero(added.observations[photo])
-        if count >= most and photo in _connected(_links(tracks, added)):
+        linked = _links(tracks, added)
+        if count >= most and linked[np.ix_(linked[photo], linked[photo])].any():
             best, most = added, count
     return best
 
 
-def _links(tracks: Tracks, found: PhotoStructure) -> NDArray[np.bool_]:
+def _links(tracks: PhotoTracks, found: PhotoStructure) -> NDArray[np.bool_]:
     """``(F, F)`` which joined photos agree: most of the points that are matched between them fit both."""
     fits = found.observations
     joined = fits.any(1)
@@ -205,7 +256,11 @@ def _connected(linked: NDArray[np.bool_]) -> set[int]:
 
     A wrong pose mostly agrees with one neighbour, on which it was based, and not with the next one too.
     """
-    triples = [t for t in combinations(np.flatnonzero(linked.any(1)).tolist(), 3) if all(linked[a, b] for a, b in combinations(t, 2))]
+    triples = [
+        triple
+        for triple in combinations(np.flatnonzero(linked.any(1)).tolist(), 3)
+        if all(linked[pair] for pair in combinations(triple, 2))
+    ]
     groups: list[tuple[set[int], set[Pair]]] = []
     for triple in triples:
         photos, edges = set(triple), set(combinations(triple, 2))
@@ -219,14 +274,20 @@ def _connected(linked: NDArray[np.bool_]) -> set[int]:
     return max((photos for photos, _ in groups), key=len, default=set())
 
 
-def keep_connected(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+def keep_connected(tracks: PhotoTracks, found: PhotoStructure) -> PhotoStructure:
     """Without photos that do not agree with the others."""
     kept = _connected(_links(tracks, found))
-    if len(kept) == len(found.photos) or len(kept) < 3:
+    if not kept:
+        return replace(found, cost=math.inf)
+    if len(kept) == len(found.photos):
         return found
     photos = tuple(photo for photo in found.photos if photo in kept)
-    seen = tracks.visible & np.isin(np.arange(len(tracks.visible)), photos)[:, None] & (found.seen | ~found.known)
-    return adjust_all(tracks, replace(found, photos=photos, seen=seen), threshold, 15)
+    seen = (
+        tracks.visible
+        & np.isin(np.arange(len(tracks.visible)), photos)[:, None]
+        & (found.seen | ~found.known)
+    )
+    return adjust_all(tracks, replace(found, photos=photos, seen=seen), 15)
 
 
 def _continued_motion(found: PhotoStructure, photo: int) -> list[tuple[FloatArray, FloatArray]]:
@@ -241,12 +302,12 @@ def _continued_motion(found: PhotoStructure, photo: int) -> list[tuple[FloatArra
     return starts
 
 
-def grow(tracks: Tracks, found: PhotoStructure, threshold: float, most: int) -> PhotoStructure:
+def grow(tracks: PhotoTracks, found: PhotoStructure, most: int) -> PhotoStructure:
     """Add photos one by one, that with most shared points first, until there are ``most`` or none can be added."""
     failed: dict[int, float] = {}
-    found = adjust_all(tracks, found, threshold, 15)
+    found = adjust_all(tracks, found, 15)
     while len(found.photos) < min(most, len(tracks.visible)):
-        found = triangulate(tracks, found, threshold)
+        found = triangulate(tracks, found)
         shared = (tracks.visible & found.known).sum(1)
         shared[found.order] = 0
         waiting = [
@@ -256,36 +317,42 @@ def grow(tracks: Tracks, found: PhotoStructure, threshold: float, most: int) -> 
         ]
         if not waiting:
             break
-        added = add_photo(tracks, found, waiting[0], threshold)
+        added = add_photo(tracks, found, waiting[0])
         if added is None:
             failed[waiting[0]] = _AGAIN * shared[waiting[0]] + 1
         else:
             found = added
-    found = triangulate(tracks, found, threshold)
+    found = triangulate(tracks, found)
     for _ in range(2):
-        found = adjust_all(tracks, found, threshold, 25)
-    return keep_connected(tracks, found, threshold)
+        found = adjust_all(tracks, found, 25)
+    return keep_connected(tracks, found)
 
 
-def seeds(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float) -> list[PhotoStructure]:
+def seeds(tracks: PhotoTracks, cameras: Sequence[FloatArray]) -> list[PhotoStructure]:
     """Structures of three photos each, under each of the lenses ``(3, 3)``."""
     found = []
     for photos in _choose_triples(tracks):
         names = np.flatnonzero(tracks.visible[list(photos)].all(0))
-        part = subset_of(tracks, np.array(photos), names)
+        part = subset_of(tracks.tracks, np.array(photos), names)
         middle, extent = part.pixels[0].mean(0), float(np.ptp(part.pixels[0], axis=0).max())
         for K in cameras:
-            depth = 2 * _RADIUS * K[0, 0] / extent
+            depth = 2 * RADIUS * K[0, 0] / extent
             t0 = np.array([*((middle - K[:2, 2]) * depth / K[0, 0]), depth])
-            for one in structure_hypotheses(part, K, t0, _RADIUS, scale=threshold / 2, keep=_STRUCTURES):
+            for one in structure_hypotheses(
+                part, K, t0, RADIUS, scale=tracks.threshold / 2, keep=_STRUCTURES
+            ):
                 frames, count = tracks.visible.shape
-                R, t, points = np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), np.full((count, 3), np.nan)
+                R, t, points = (
+                    np.tile(np.eye(3), (frames, 1, 1)),
+                    np.zeros((frames, 3)),
+                    np.full((count, 3), np.nan),
+                )
                 R[list(photos)], t[list(photos)], points[names] = one.R, one.t, one.points
                 found.append(PhotoStructure(photos, R, t, points, tracks.visible.copy(), K, one.cost))
     return found
 
 
-def _choose_triples(tracks: Tracks) -> list[tuple[int, int, int]]:
+def _choose_triples(tracks: PhotoTracks) -> list[tuple[int, int, int]]:
     """Threes of photos that share many points, whose image changes its form; no two of them share two photos."""
     common = tracks.visible.astype(int) @ tracks.visible.T.astype(int)
     shared = []
@@ -298,7 +365,7 @@ def _choose_triples(tracks: Tracks) -> list[tuple[int, int, int]]:
     scored = []
     for count, triple in shared[:_MOST_TRIPLES]:
         names = np.flatnonzero(tracks.visible[list(triple)].all(0))
-        deformation = image_deformation(subset_of(tracks, np.array(triple), names))
+        deformation = image_deformation(subset_of(tracks.tracks, np.array(triple), names))
         scored.append((min(count, _ENOUGH_POINTS) * min(deformation, _ENOUGH_DEFORMATION), triple))
     chosen: list[tuple[int, int, int]] = []
     for _, triple in sorted(scored, key=lambda one: -one[0]):
@@ -307,23 +374,24 @@ def _choose_triples(tracks: Tracks) -> list[tuple[int, int, int]]:
     return chosen
 
 
-def solve_photos(tracks: Tracks, cameras: Sequence[FloatArray], threshold: float) -> list[PhotoStructure]:
+def solve_photos(tracks: PhotoTracks, cameras: Sequence[FloatArray]) -> list[PhotoStructure]:
     """Structures of as many photos as can be joined, each from another start, the best first."""
-    begun = [grow(tracks, seed, threshold, _SEED_PHOTOS) for seed in seeds(tracks, cameras, threshold)]
+    begun = [grow(tracks, seed, _SEED_PHOTOS) for seed in seeds(tracks, cameras)]
     begun = [one for one in begun if math.isfinite(one.cost)]
     begun.sort(key=lambda one: (-min(len(one.photos), _SEED_PHOTOS), -one.support))
     grown = []
     for one in begun[:_GROWN]:
         for _ in range(_ROUNDS):
             before = len(one.photos)
-            one = grow(tracks, one, threshold, len(tracks.visible))
-            if len(one.photos) <= before:
+            one = grow(tracks, one, len(tracks.visible))
+            if len(one.photos) <= before or not math.isfinite(one.cost):
                 break
-        grown.append(one)
+        if math.isfinite(one.cost):
+            grown.append(one)
     return sorted(grown, key=lambda one: (-len(one.photos), -one.support))
 
 
-def reverse(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStructure:
+def reverse(tracks: PhotoTracks, found: PhotoStructure) -> PhotoStructure:
     """The same photos and points, reversed in depth and adjusted."""
     order, known = found.order, found.known
     T = np.tile(np.eye(4), (len(order), 1, 1))
@@ -332,7 +400,7 @@ def reverse(tracks: Tracks, found: PhotoStructure, threshold: float) -> PhotoStr
     turned = reversal.poses(T)
     R, t, points = found.R.copy(), found.t.copy(), found.points.copy()
     R[order], t[order], points[known] = turned[:, :3, :3], turned[:, :3, 3], reversal.points(points[known])
-    return adjust_all(tracks, replace(found, R=R, t=t, points=points), threshold, 40)
+    return adjust_all(tracks, replace(found, R=R, t=t, points=points), 40)
 
 
 def facing(found: PhotoStructure) -> float:
@@ -373,3 +441,150 @@ def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure) -> float:
         drawn = cv2.dilate(drawn, np.ones((_CELL, _CELL), np.uint8))
         filled.append(float(drawn[inside].mean()))
     return float(np.mean(filled))
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoStart:
+    """What came of a set of photos.
+
+    Attributes:
+        tracks: The points that they share.
+        structure: Poses and points; None if none is believed.
+        reason: Which photos are not joined, and what to do about that; empty if all are.
+    """
+
+    tracks: PhotoTracks
+    structure: PhotoStructure | None
+    reason: str
+
+
+def start_of_photos(photos: Sequence[Photo], camera: Camera) -> PhotoStart:
+    """Join photos of one object, as many as can be.
+
+    Args:
+        photos: The photos, in the order in which they were most likely taken; at most `MOST_PHOTOS`.
+        camera: The camera of all; if its focal length is assumed, others are tried and the best is found.
+    """
+    threshold = max(_LEAST_THRESHOLD, _THRESHOLD * float(np.median([photo.length for photo in photos])))
+    cameras = [camera.K]
+    if camera.assumed:
+        cameras = [
+            camera.zoom(Camera.from_fov(camera.width, camera.height, angle).fy / camera.fy, "").K
+            for angle in _FIELDS_OF_VIEW
+        ]
+    neighbours = neighbouring_pairs(len(photos), _NEIGHBOURS)
+    best = PhotoStart(PhotoTracks(join_tracks(photos, {}), threshold), None, "")
+    matches: Matches = {}
+    for pairs in (neighbours, list(combinations(range(len(photos)), 2))):
+        found = match_photos(photos, set(pairs) - matches.keys(), cameras[0], threshold)
+        matches = {**matches, **found}
+        tracks = PhotoTracks(join_tracks(photos, matches), threshold, camera.assumed)
+        solved = [_upright(tracks, one) for one in solve_photos(tracks, cameras)]
+        believed = [one for one, evidence in solved if is_believed(photos, one, evidence)]
+        most = 0 if best.structure is None else len(best.structure.photos)
+        if believed and len(believed[0].photos) > most:
+            best = PhotoStart(tracks, believed[0], "")
+        if best.structure is not None and len(best.structure.photos) == len(photos):
+            break
+    return replace(best, reason=_why_not_joined(photos, matches, best.structure))
+
+
+def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure, float]:
+    """The better of a structure and its reversal in depth, and the evidence that it is that one: 1 is enough."""
+    other = reverse(tracks, found)
+    if other.cost < found.cost:
+        found, other = other, found
+    ratio = min(other.cost / max(found.cost, 1e-9), _CLEAR_RATIO**3)
+    return found, math.log(ratio) / math.log(_CLEAR_RATIO) + facing(found) / _CLEAR_FACING
+
+
+def is_believed(photos: Sequence[Photo], found: PhotoStructure, evidence: float) -> bool:
+    """Whether photos are joined as the object has turned: points and outlines fit, and it is not reversed in depth."""
+    return (
+        len(found.photos) >= _FEWEST_PHOTOS
+        and found.cost < _HIGHEST_COST
+        and evidence >= 1
+        and overlap_of_hull(photos, found) >= _LEAST_FILLED
+    )
+
+
+def _why_not_joined(photos: Sequence[Photo], matches: Matches, found: PhotoStructure | None) -> str:
+    """Which photo is not joined, in words; empty if all are."""
+    count, joined = len(photos), set() if found is None else set(found.photos)
+    if len(joined) == count:
+        return ""
+    shared = np.zeros((count, count), int)
+    for (a, b), matched in matches.items():
+        shared[a, b] = shared[b, a] = len(matched)
+
+    def beside(photo: int) -> list[int]:
+        return [place for place in (photo - 1, photo + 1) if 0 <= place < count]
+
+    missing = [photo for photo in range(count) if photo not in joined]
+    near = [photo for photo in missing if any(place in joined for place in beside(photo))] or missing
+    worst = min(near, key=lambda photo: sum(shared[photo, place] for place in beside(photo)))
+    how_many = f"{count} photos, {len(joined) or 'none'} joined"
+    if np.median([shared[a, a + 1] for a in range(count - 1)]) >= _MANY_SHARED and not joined:
+        return f"{how_many}; points on it do not move as one solid (reflections?)"
+    names = " and ".join(str(photos[place].index) for place in beside(worst))
+    return (
+        f"{how_many}; photo {photos[worst].index} shares too few points with photo"
+        f"{'s' if len(beside(worst)) > 1 else ''} {names}: take one every 20 degrees or less"
+    )
+
+
+def initial_map_of_photos(
+    object_map: ObjectMap,
+    start: PhotoStart,
+    photos: Sequence[Photo],
+    views: Sequence[Keyframe],
+    camera: Camera,
+    weights: FitWeights,
+) -> tuple[InitialMap, list[Keyframe]]:
+    """The first map of joined photos, in the object's unit, and all views with the points that they show of it.
+
+    Args:
+        object_map: Prototype and landmarks; its keyframes are not used.
+        start: The joined photos.
+        photos: All photos that were tried, and
+        views: the same as views, each with a pose that places the object at the depth of its mask.
+        camera: The camera of the views.
+        weights: The weights of the shape's terms.
+    """
+    found, tracks = start.structure, start.tracks
+    assert found is not None
+    solved = camera.with_solved_focal(float(found.K[1, 1] / camera.fy)) if camera.assumed else camera
+    first = min(found.photos)
+    R0, t0 = found.R[first], found.t[first]
+    middle = np.nanmedian(found.points, axis=0)
+    _, placed = pose_arrays(with_focal_length(views[first], camera, solved).pose)
+    size = float(placed[2]) / float((R0 @ middle + t0)[2])
+    base = len(object_map.landmarks)
+    landmarks = np.concatenate([object_map.landmarks, size * (found.points - middle) @ R0.T])
+    candidate = np.concatenate([object_map.candidate, np.zeros(len(found.points), bool)])
+    shown, keyframes = [], []
+    for place, (photo, view) in enumerate(zip(photos, views, strict=True)):
+        names = np.flatnonzero(found.observations[place])
+        points = FollowedPoints(
+            (base + names).astype(np.int64), tracks.pixels[place, names].astype(np.float32)
+        )
+        shown.append(replace(view, points=points, texture=None, **_labelled_keypoints(photo, points)))
+        if place in found.photos:
+            translation = size * (found.R[place] @ middle + found.t[place])
+            pose = pose_from_arrays(found.R[place] @ R0.T, translation, object_map.vertices)
+            keyframes.append(replace(with_focal_length(shown[-1], camera, solved), pose=pose))
+    object_map = replace(object_map, landmarks=landmarks, candidate=candidate, keyframes=tuple(keyframes))
+    object_map = fit_shape(object_map, list(range(len(keyframes))), weights, 4)
+    return InitialMap(object_map, found.cost, found.cost, "photos", solved), shown
+
+
+def _labelled_keypoints(photo: Photo, points: FollowedPoints) -> dict[str, Any]:
+    """The keypoints of a photo's first method as a keyframe has them, with the landmarks that they show."""
+    keypoints = photo.keypoints[0]
+    if not (len(keypoints) and len(points)):
+        return {"keypoints": Keypoints.none(), "keypoint_landmark": np.zeros(0, np.int64)}
+    gap, nearest = KDTree(points.pixel).query(keypoints.pixel)
+    return {
+        "keypoints": keypoints,
+        "keypoint_landmark": np.where(gap < SAME_PLACE, points.landmark[nearest], -1).astype(np.int64),
+    }

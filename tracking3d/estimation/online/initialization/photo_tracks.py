@@ -25,7 +25,7 @@ _STILL = 0.03  # share of the object's length; matches that move by less stand s
 _SILHOUETTE_SIZE = 160  # pixels along the longer side of a silhouette (chosen)
 _FEWEST_MATCHES, _LEAST_SHARE = 10, 0.15  # inliers of a pair, and their share of its matches (chosen)
 _SAME_PIXELS = 2.0  # matches within a square of so many pixels count as one (chosen)
-_SAME_PLACE = 1.5  # pixels within which keypoints are one place (as in the start of a video)
+SAME_PLACE = 1.5  # pixels within which keypoints are one place (as in the start of a video)
 _ITERATIONS, _CONFIDENCE = 1000, 0.999  # of the sampling of essential matrices
 
 Pair = tuple[int, int]
@@ -122,9 +122,7 @@ class Photo:
 
 def neighbouring_pairs(count: int, distance: int) -> list[Pair]:
     """Pairs of photos that follow each other within some places, the last ones being followed by the first."""
-    return [
-        (a, b) for a, b in combinations(range(count), 2) if min(b - a, count - (b - a)) <= distance
-    ]
+    return [(a, b) for a, b in combinations(range(count), 2) if min(b - a, count - (b - a)) <= distance]
 
 
 def match_photos(
@@ -184,7 +182,10 @@ def join_tracks(photos: Sequence[Photo], matches: Matches) -> Tracks:
     owner, pixel = list[int](), list[FloatArray]()
     for number, photo in enumerate(photos):
         grid, first, place = np.unique(
-            np.round(photo.pixels / _SAME_PLACE).astype(np.int64), axis=0, return_index=True, return_inverse=True
+            np.round(photo.pixels / SAME_PLACE).astype(np.int64),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
         )
         places.append(place.ravel() + len(owner))
         owner += [number] * len(grid)
