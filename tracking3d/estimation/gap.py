@@ -1,10 +1,11 @@
-"""Frames that a solver is to track the object through, from a keyframe next to them."""
+"""Frames of a source that has ended, for a solver: next to a keyframe, or as photos without order."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, MaskEstimate
 
 
@@ -34,3 +35,29 @@ class Gap:
     anchor: Frame
     frames: Iterable[tuple[Frame, MaskEstimate]]
     backwards: bool
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Frames as photos, which need not follow each other closely.
+
+    Attributes:
+        indices: Of those in which the object was seen, in order.
+        read: Gives those with some of the indices, in order, with their initial masks, as often as it is called.
+    """
+
+    indices: tuple[int, ...]
+    read: Callable[[Collection[int]], Iterator[tuple[Frame, MaskEstimate]]]
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoEstimates:
+    """What a solver makes of a set of photos.
+
+    Attributes:
+        estimates: With the object's first map, for the photos that were joined or found by it; empty if there is none.
+        reason: Which photos are not joined, and what to do about that; empty if all are.
+    """
+
+    estimates: tuple[FrameEstimate, ...]
+    reason: str

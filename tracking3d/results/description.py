@@ -93,10 +93,12 @@ class StartOfModel:
     Attributes:
         frame: Index of the frame.
         reason: Why it started there, in words.
+        advice: Of photos, which could not be joined, and what to do about that; empty if all were.
     """
 
     frame: int
     reason: str
+    advice: str = ""
 
 
 def refinement(

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 _MAX_KEYPOINTS = 250  # most keypoints of a frame
 _CONTRAST = 0.02  # half of OpenCV's default, for the faint texture of small objects
 _SIZE = 200  # length in pixels to which the object's longer side is scaled
-_SMALLEST = 100  # pixels; the longer side is scaled up as if it had at least so many, and down by the same factor
+_SMALLEST = (
+    100  # pixels; the longer side is scaled up as if it had at least so many, and down by the same factor
+)
 _BORDER = 8  # pixels around the object that descriptors may use
 _RATIO = 0.8  # ratio of the distances to the best and the second-best match, Lowe 2004, section 7.1
 _SAME_CORNER = 2.0  # pixels within which keypoints are one corner, at several scales and orientations
