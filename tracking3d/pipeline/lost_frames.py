@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterator
-from contextlib import closing
 from dataclasses import replace
 
 from tracking3d.estimation.estimate import UNALIGNED_MAP, Status
@@ -92,8 +91,7 @@ def start_from_photos(
 
     def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
         wanted = frozenset(indices)
-        with closing(read_again(source)) as frames:
-            yield from masks.with_masks(frame for frame in frames if frame.index in wanted)
+        return masks.with_masks(frame for frame in read_again(source) if frame.index in wanted)
 
     report_progress("joining photos")
     seen = tuple(sorted(index for index in causal if masks.has_mask(index)))

@@ -220,7 +220,8 @@ class OnlineSolver(MapInitialization):
         if state.phase is SolverPhase.INITIALIZING:
             start = try_initialize(state, self.online, ended=True)[1] if ended else None
             return start is not None and not start.object_map.pointless
-        return any(not other.object_map.pointless for other in (state, *state.inactive_maps))
+        maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
+        return not all(one.pointless for one in maps)
 
     def start_from_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.PhotoSolver`."""

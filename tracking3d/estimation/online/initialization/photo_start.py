@@ -224,7 +224,8 @@ def add_photo(tracks: PhotoTracks, found: PhotoStructure, photo: int) -> PhotoSt
     for start in _continued_motion(found, photo):
         poses.append(pose_from_points(points, pixels, found.K, start, threshold=3 * tracks.threshold, seed=0))
     common = tracks.visible[photo] & tracks.visible[found.order].any(0)
-    best, most = None, max(_LEAST_POINTS, _LEAST_SHARE * np.count_nonzero(common))
+    best: PhotoStructure | None = None
+    most: float = max(_LEAST_POINTS, _LEAST_SHARE * np.count_nonzero(common))
     for pose in poses:
         if pose is None or transform_to_camera(pose.R, pose.t, points)[pose.inliers, 2].min() <= 0:
             continue
@@ -233,7 +234,7 @@ def add_photo(tracks: PhotoTracks, found: PhotoStructure, photo: int) -> PhotoSt
         seen[photo] = tracks.visible[photo]
         added = replace(found, photos=(*found.photos, photo), R=R, t=t, seen=seen)
         added = adjust_all(tracks, triangulate(tracks, added), 8)
-        count = np.count_nonzero(added.observations[photo])
+        count = int(np.count_nonzero(added.observations[photo]))
         linked = _links(tracks, added)
         if count >= most and linked[np.ix_(linked[photo], linked[photo])].any():
             best, most = added, count
@@ -246,9 +247,9 @@ def _links(tracks: PhotoTracks, found: PhotoStructure) -> NDArray[np.bool_]:
     joined = fits.any(1)
     there = (tracks.visible & joined[:, None]).astype(int)
     common, kept = there @ there.T, fits.astype(int) @ fits.T.astype(int)
-    linked = (common >= _LINK_POINTS) & (kept >= _LINK_SHARE * common)
+    linked: NDArray[np.bool_] = (common >= _LINK_POINTS) & (kept >= _LINK_SHARE * common)
     np.fill_diagonal(linked, False)
-    return np.asarray(linked, np.bool_)
+    return linked
 
 
 def _connected(linked: NDArray[np.bool_]) -> set[int]:

@@ -206,6 +206,6 @@ def join_tracks(photos: Sequence[Photo], matches: Matches) -> Tracks:
     joined = [group for group in members if len(group) >= 2]
     pixels = np.full((len(photos), len(joined), 2), np.nan)
     for number, group in enumerate(joined):
-        for photo_number, place in group.items():
-            pixels[photo_number, number] = pixel[place]
+        for shown_in, node in group.items():
+            pixels[shown_in, number] = pixel[node]
     return Tracks(pixels, np.isfinite(pixels[..., 0]))
