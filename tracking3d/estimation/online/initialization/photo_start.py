@@ -82,10 +82,12 @@ _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and
 # A structure is believed (measured on seven sets, right ones and wrong ones): most of its cost, the ratio of the costs
 # of its reversal and itself and the facing either of which is evidence enough, and the least share of masks filled.
 _FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.9
+_MOST_JOINED = 0.6  # share of the photos from which no other pairing of them is tried (chosen)
 _MANY_SHARED = 25  # matches of neighbours, at the median, from which it is not points that lack (chosen)
 # The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
-# points from their middle, share of the photos that must show a cell inside, and pixels that a cell covers (chosen).
-_GRID, _BLOCK, _VOTES, _CELL = 40, 2.5, 0.9, 9
+# points from their middle, share of the photos that must show a cell inside, and cells that a cell covers in a photo
+# (chosen).
+_GRID, _BLOCK, _VOTES, _CELL = 64, 2.5, 0.9, 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +441,10 @@ def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure) -> float:
         inside = photos[photo].silhouette.inside
         drawn = np.zeros(inside.shape, np.uint8)
         drawn[place[left, 1], place[left, 0]] = 1
-        drawn = cv2.dilate(drawn, np.ones((_CELL, _CELL), np.uint8))
+        depth = float((found.R[photo] @ middle + found.t[photo])[2])
+        cell = 2 * _BLOCK * size / _GRID * found.K[1, 1] / depth * photos[photo].silhouette.scale
+        width = 2 * math.ceil(_CELL * cell / 2) + 1
+        drawn = cv2.dilate(drawn, np.ones((width, width), np.uint8))
         filled.append(float(drawn[inside].mean()))
     return float(np.mean(filled))
 
@@ -485,7 +490,7 @@ def start_of_photos(photos: Sequence[Photo], camera: Camera) -> PhotoStart:
         most = 0 if best.structure is None else len(best.structure.photos)
         if believed and len(believed[0].photos) > most:
             best = PhotoStart(tracks, believed[0], "")
-        if best.structure is not None and len(best.structure.photos) == len(photos):
+        if best.structure is not None and len(best.structure.photos) >= _MOST_JOINED * len(photos):
             break
     return replace(best, reason=_why_not_joined(photos, matches, best.structure))
 
