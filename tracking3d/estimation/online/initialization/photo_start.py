@@ -81,7 +81,8 @@ _FOCAL_PHOTOS = 4  # from which the focal length is free
 _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and 8 degrees
 # A structure is believed (measured on seven sets, right ones and wrong ones): most of its cost, the ratio of the costs
 # of its reversal and itself and the facing either of which is evidence enough, and the least share of masks filled.
-_FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.9
+_FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.95
+_LEAST_JOINED = 0.4  # share of the photos that is joined at least (chosen)
 _MOST_JOINED = 0.6  # share of the photos from which no other pairing of them is tried (chosen)
 _MANY_SHARED = 25  # matches of neighbours, at the median, from which it is not points that lack (chosen)
 # The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
@@ -507,7 +508,7 @@ def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure
 def is_believed(photos: Sequence[Photo], found: PhotoStructure, evidence: float) -> bool:
     """Whether photos are joined as the object has turned: points and outlines fit, and it is not reversed in depth."""
     return (
-        len(found.photos) >= _FEWEST_PHOTOS
+        len(found.photos) >= max(_FEWEST_PHOTOS, _LEAST_JOINED * len(photos))
         and found.cost < _HIGHEST_COST
         and evidence >= 1
         and overlap_of_hull(photos, found) >= _LEAST_FILLED
@@ -528,7 +529,7 @@ def _why_not_joined(photos: Sequence[Photo], matches: Matches, found: PhotoStruc
 
     missing = [photo for photo in range(count) if photo not in joined]
     near = [photo for photo in missing if any(place in joined for place in beside(photo))] or missing
-    worst = min(near, key=lambda photo: sum(shared[photo, place] for place in beside(photo)))
+    worst = min(near, key=lambda photo: float(np.mean(shared[photo, beside(photo)])))
     how_many = f"{count} photos, {len(joined) or 'none'} joined"
     if np.median([shared[a, a + 1] for a in range(count - 1)]) >= _MANY_SHARED and not joined:
         return f"{how_many}; points on it do not move as one solid (reflections?)"
