@@ -39,25 +39,15 @@ class Gap:
 
 @dataclass(frozen=True)
 class PhotoSet:
-    """Frames as photos, which need not follow each other closely.
+    """Frames as photos, which need not follow each other closely; ``read`` gives some, as often as it is called."""
 
-    Attributes:
-        indices: Of those in which the object was seen, in order.
-        read: Gives those with some of the indices, in order, with their initial masks, as often as it is called.
-    """
-
-    indices: tuple[int, ...]
+    indices: tuple[int, ...]  # of those in which the object was seen, in order
     read: Callable[[Collection[int]], Iterator[tuple[Frame, MaskEstimate]]]
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoEstimates:
-    """What a solver makes of a set of photos.
+    """What a solver makes of a set of photos."""
 
-    Attributes:
-        estimates: With the object's first map, for the photos that were joined or found by it; empty if there is none.
-        reason: Which photos are not joined, and what to do about that; empty if all are.
-    """
-
-    estimates: tuple[FrameEstimate, ...]
-    reason: str
+    estimates: tuple[FrameEstimate, ...]  # with the map of those that were joined; empty if there is none
+    reason: str  # which photos are not joined, and what to do about that; empty if all are

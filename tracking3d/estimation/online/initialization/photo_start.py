@@ -93,17 +93,11 @@ _GRID, _BLOCK, _VOTES, _CELL = 64, 2.5, 0.9, 1.2
 
 @dataclass(frozen=True, eq=False)
 class PhotoTracks:
-    """The points that photos share, and how they are fitted.
-
-    Attributes:
-        tracks: Points through the photos.
-        threshold: Largest residual of an inlier in pixels.
-        free_focal: Whether the focal length is to be found, too.
-    """
+    """The points that photos share, and how they are fitted."""
 
     tracks: Tracks
-    threshold: float
-    free_focal: bool = True
+    threshold: float  # largest residual of an inlier in pixels
+    free_focal: bool = True  # whether the focal length is to be found, too
 
     @property
     def visible(self) -> NDArray[np.bool_]:
@@ -118,25 +112,15 @@ class PhotoTracks:
 
 @dataclass(frozen=True, eq=False)
 class PhotoStructure:
-    """Photos that were joined, and the points that they share.
+    """Photos that were joined, and the points that they share."""
 
-    Attributes:
-        photos: Places of the joined photos, in the order in which they were joined.
-        R: ``(F, 3, 3)`` and
-        t: ``(F, 3)`` the pose of every photo; only those of joined ones mean anything.
-        points: ``(N, 3)``; nan for those that are not known.
-        seen: ``(F, N)`` the observations that fit.
-        K: ``(3, 3)``.
-        cost: Mean Cauchy loss of the observations.
-    """
-
-    photos: tuple[int, ...]
-    R: FloatArray
+    photos: tuple[int, ...]  # places of the joined photos, in the order in which they were joined
+    R: FloatArray  # (F, 3, 3) and t (F, 3) of every photo; only those of joined ones mean anything
     t: FloatArray
-    points: FloatArray
-    seen: NDArray[np.bool_]
-    K: FloatArray
-    cost: float = math.inf
+    points: FloatArray  # (N, 3); nan for those that are not known
+    seen: NDArray[np.bool_]  # (F, N) the observations that fit
+    K: FloatArray  # (3, 3)
+    cost: float = math.inf  # mean Cauchy loss of the observations
 
     @property
     def order(self) -> NDArray[np.intp]:
@@ -452,17 +436,11 @@ def overlap_of_hull(photos: Sequence[Photo], found: PhotoStructure) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PhotoStart:
-    """What came of a set of photos.
-
-    Attributes:
-        tracks: The points that they share.
-        structure: Poses and points; None if none is believed.
-        reason: Which photos are not joined, and what to do about that; empty if all are.
-    """
+    """What came of a set of photos."""
 
     tracks: PhotoTracks
-    structure: PhotoStructure | None
-    reason: str
+    structure: PhotoStructure | None  # None if none is believed
+    reason: str  # which photos are not joined, and what to do about that; empty if all are
 
 
 def start_of_photos(photos: Sequence[Photo], camera: Camera) -> PhotoStart:

@@ -35,15 +35,10 @@ Matches = Mapping[Pair, NDArray[np.int64]]
 
 @dataclass(frozen=True, eq=False)
 class KeypointMethod:
-    """A way to find and match keypoints; others than SIFT, such as networks, are added to `METHODS`.
+    """A way to find and match keypoints; others than SIFT, such as networks, are added to `METHODS`."""
 
-    Attributes:
-        detect: Gives the keypoints of a grey image ``(H, W)`` inside a mask ``(H, W)``.
-        match: Gives ``(K, 2)`` indices of the keypoints that two photos share.
-    """
-
-    detect: Callable[[NDArray[np.uint8], NDArray[np.bool_]], Keypoints]
-    match: Callable[[Keypoints, Keypoints], NDArray[np.int64]]
+    detect: Callable[[NDArray[np.uint8], NDArray[np.bool_]], Keypoints]  # grey image and mask, both (H, W)
+    match: Callable[[Keypoints, Keypoints], NDArray[np.int64]]  # gives (K, 2) indices
 
 
 METHODS: tuple[KeypointMethod, ...] = (
@@ -56,17 +51,11 @@ METHODS: tuple[KeypointMethod, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """The mask of a photo around the object, scaled down.
+    """The mask of a photo around the object, scaled down."""
 
-    Attributes:
-        inside: ``(h, w)``, with an empty border.
-        corner: ``(2,)`` x and y in the photo of the outer corner of its first pixel.
-        scale: Its pixels for one pixel of the photo.
-    """
-
-    inside: NDArray[np.bool_]
-    corner: FloatArray
-    scale: float
+    inside: NDArray[np.bool_]  # (h, w), with an empty border
+    corner: FloatArray  # (2,) x and y in the photo of the outer corner of its first pixel
+    scale: float  # its pixels for one pixel of the photo
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_]) -> Silhouette:
@@ -87,31 +76,18 @@ class Silhouette:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """What is known of one photo.
+    """What is known of one photo."""
 
-    Attributes:
-        index: Its index in the source.
-        keypoints: Those of each of the methods.
-        silhouette: Its mask.
-        length: The longer side of the object in pixels.
-    """
-
-    index: int
-    keypoints: tuple[Keypoints, ...]
+    index: int  # in the source
+    keypoints: tuple[Keypoints, ...]  # of each of `METHODS`
     silhouette: Silhouette
-    length: float
+    length: float  # pixels of the object's longer side
 
     @classmethod
-    def of(
-        cls,
-        index: int,
-        grey: NDArray[np.uint8],
-        mask: NDArray[np.bool_],
-        methods: Sequence[KeypointMethod] = METHODS,
-    ) -> Photo:
+    def of(cls, index: int, grey: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Photo:
         """Find the keypoints of a grey photo ``(H, W)`` inside a mask ``(H, W)`` that is not empty."""
         *_, width, height = cv2.boundingRect(mask.astype(np.uint8))
-        found = tuple(method.detect(grey, mask) for method in methods)
+        found = tuple(method.detect(grey, mask) for method in METHODS)
         return cls(index, found, Silhouette.of(mask), float(max(width, height)))
 
     @property
@@ -130,7 +106,6 @@ def match_photos(
     pairs: Iterable[Pair],
     K: FloatArray,
     threshold: float,
-    methods: Sequence[KeypointMethod] = METHODS,
 ) -> Matches:
     """The matches of pairs of photos that move in the picture, and between two views of one solid.
 
@@ -139,13 +114,12 @@ def match_photos(
         pairs: Which of them are compared.
         K: ``(3, 3)`` of a likely lens; it matters little.
         threshold: Largest distance in pixels from the epipolar line.
-        methods: The methods that the photos' keypoints were found by.
     """
     found = {}
     length = float(np.median([photo.length for photo in photos]))
     pixels = [photo.pixels for photo in photos]
     for a, b in pairs:
-        matched = _match_pair(photos[a], photos[b], methods)
+        matched = _match_pair(photos[a], photos[b])
         x, y = pixels[a][matched[:, 0]], pixels[b][matched[:, 1]]
         moving = np.linalg.norm(x - y, axis=1) > _STILL * length
         matched, x, y = matched[moving], x[moving], y[moving]
@@ -163,10 +137,10 @@ def match_photos(
     return found
 
 
-def _match_pair(a: Photo, b: Photo, methods: Sequence[KeypointMethod]) -> NDArray[np.int64]:
+def _match_pair(a: Photo, b: Photo) -> NDArray[np.int64]:
     """``(M, 2)`` places in `Photo.pixels`."""
     matched, before = [], np.zeros(2, np.int64)
-    for method, here, there in zip(methods, a.keypoints, b.keypoints, strict=True):
+    for method, here, there in zip(METHODS, a.keypoints, b.keypoints, strict=True):
         matched.append(method.match(here, there) + before)
         before += [len(here), len(there)]
     return np.concatenate(matched)
