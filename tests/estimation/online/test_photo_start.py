@@ -28,7 +28,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
 )
 from tracking3d.estimation.online.initialization.photo_tracks import (
     Photo,
-    Silhouette,
+    PhotoSilhouette,
     join_tracks,
     match_photos,
     neighbouring_pairs,
@@ -156,7 +156,7 @@ def test_neighbours_are_those_within_two_places_around_the_turn():
 
 def keypoints_at(*pixels: tuple[float, float]) -> Photo:
     found = Keypoints(np.array(pixels, np.float32), np.zeros((len(pixels), 128), np.float32))
-    return Photo(0, (found,), Silhouette.of(np.ones((9, 9), bool)), 9.0)
+    return Photo(0, (found,), PhotoSilhouette.of(np.ones((9, 9), bool)), 9.0)
 
 
 def test_a_track_has_one_place_in_a_photo_and_the_stronger_pair_decides():
@@ -257,7 +257,7 @@ def full_turn() -> tuple[PhotoTracks, PhotoStructure, list[Photo]]:
         mask = np.zeros((240, 320), np.uint8)
         mask[pixels[:, 1], pixels[:, 0]] = 1
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0
-        photos.append(Photo(index, (Keypoints.none(),), Silhouette.of(mask), 200.0))
+        photos.append(Photo(index, (Keypoints.none(),), PhotoSilhouette.of(mask), 200.0))
     return tracks, truth, photos
 
 

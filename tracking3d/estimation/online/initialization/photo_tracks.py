@@ -50,7 +50,7 @@ METHODS: tuple[KeypointMethod, ...] = (
 
 
 @dataclass(frozen=True, eq=False)
-class Silhouette:
+class PhotoSilhouette:
     """The mask of a photo around the object, scaled down."""
 
     inside: NDArray[np.bool_]  # (h, w), with an empty border
@@ -58,7 +58,7 @@ class Silhouette:
     scale: float  # its pixels for one pixel of the photo
 
     @classmethod
-    def of(cls, mask: NDArray[np.bool_]) -> Silhouette:
+    def of(cls, mask: NDArray[np.bool_]) -> PhotoSilhouette:
         """The silhouette of a mask ``(H, W)`` that is not empty."""
         x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
         scale = min(_SILHOUETTE_SIZE / max(width, height), 1.0)
@@ -80,7 +80,7 @@ class Photo:
 
     index: int  # in the source
     keypoints: tuple[Keypoints, ...]  # of each of `METHODS`
-    silhouette: Silhouette
+    silhouette: PhotoSilhouette
     length: float  # pixels of the object's longer side
 
     @classmethod
@@ -88,7 +88,7 @@ class Photo:
         """Find the keypoints of a grey photo ``(H, W)`` inside a mask ``(H, W)`` that is not empty."""
         *_, width, height = cv2.boundingRect(mask.astype(np.uint8))
         found = tuple(method.detect(grey, mask) for method in METHODS)
-        return cls(index, found, Silhouette.of(mask), float(max(width, height)))
+        return cls(index, found, PhotoSilhouette.of(mask), float(max(width, height)))
 
     @property
     def pixels(self) -> FloatArray:
