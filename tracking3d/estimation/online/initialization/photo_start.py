@@ -231,8 +231,7 @@ def add_photo(tracks: PhotoTracks, found: PhotoStructure, photo: int) -> PhotoSt
 def _links(tracks: PhotoTracks, found: PhotoStructure) -> NDArray[np.bool_]:
     """``(F, F)`` which joined photos agree: most of the points that are matched between them fit both."""
     fits = found.observations
-    joined = fits.any(1)
-    there = (tracks.visible & joined[:, None]).astype(int)
+    there = (tracks.visible & np.any(fits, axis=1, keepdims=True)).astype(int)
     common, kept = there @ there.T, fits.astype(int) @ fits.T.astype(int)
     linked: NDArray[np.bool_] = (common >= _LINK_POINTS) & (kept >= _LINK_SHARE * common)
     np.fill_diagonal(linked, False)
