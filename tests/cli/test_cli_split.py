@@ -59,6 +59,7 @@ def test_a_video_that_was_not_cut_says_why(call, clip, parts):
     parts[1].append(SplitResult((Path("run"),), 1, "clip has 5 frames, which is one part"))
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert "one part" in result.stderr
+    assert "--split is for long videos" in result.stderr
 
 
 def test_what_stops_it_says_how_to_go_on(call, clip, parts, tmp_path):

@@ -90,7 +90,7 @@ def rotation_errors(poses) -> np.ndarray:
 
 @pytest.fixture
 def video(tmp_path):
-    """A folder of images."""
+    """A folder of images, which `run` takes as a video."""
     folder = tmp_path / "frames"
     folder.mkdir()
     for index, image in enumerate(turning().images):
@@ -114,7 +114,7 @@ def lose(monkeypatch, frames) -> None:
 
 def run(video, folder) -> RunReader:
     record(
-        open_source(str(video)),
+        open_source(str(video), fps=30),
         settings("crop.size=64", "object.frequency=5"),
         folder,
         mask=turning().masks[0],

@@ -76,7 +76,10 @@ def _print_summaries(ended: SplitResult) -> None:
             err=True,
         )
     elif ended.reason:
-        typer.echo(f"Tracked as one part: {ended.reason}.", err=True)
+        typer.echo(
+            f"Tracked as one part: {ended.reason}. --split is for long videos, and photos need none.",
+            err=True,
+        )
 
 
 def _check(request: RunRequest, workers: int | None, display: RunDisplay) -> None:

@@ -1,10 +1,11 @@
-"""Frames that a solver is to track the object through, from a keyframe next to them."""
+"""Frames of a source that has ended, for a solver: next to a keyframe, or as photos without order."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, MaskEstimate
 
 
@@ -34,3 +35,19 @@ class Gap:
     anchor: Frame
     frames: Iterable[tuple[Frame, MaskEstimate]]
     backwards: bool
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Frames as photos, which need not follow each other closely; ``read`` gives some, as often as it is called."""
+
+    indices: tuple[int, ...]  # of those in which the object was seen, in order
+    read: Callable[[Collection[int]], Iterator[tuple[Frame, MaskEstimate]]]
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoEstimates:
+    """What a solver makes of a set of photos."""
+
+    estimates: tuple[FrameEstimate, ...]  # with the map of those that were joined; empty if there is none
+    reason: str  # which photos are not joined, and what to do about that; empty if all are

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
-from tracking3d.estimation.gap import Gap, ModelCoverage
+from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoEstimates, PhotoSet
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.shape import Shape
@@ -125,6 +125,22 @@ class ExtendingSolver(Protocol, Generic[State]):
 
     def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
         """The state that refines frames from other poses ``(4, 4)`` than the causal ones, by frame index."""
+        ...
+
+
+@runtime_checkable
+class PhotoSolver(Protocol, Generic[State]):
+    """A solver that can start from photos, whatever their order and the turn between them."""
+
+    def has_points(self, state: State, ended: bool) -> bool:
+        """Whether there is a map with points after the last frame; if it has ``ended``, also one made only then."""
+        ...
+
+    def start_from_photos(self, state: State, photos: PhotoSet) -> tuple[State, PhotoEstimates]:
+        """The state for ``refine`` with a map of the photos, in place of any that there is.
+
+        If the photos cannot be joined, it is the same state, which knows the reason.
+        """
         ...
 
 

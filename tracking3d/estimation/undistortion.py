@@ -6,7 +6,7 @@ and the solver's own state are of the pinhole camera.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Generic, Self
 
@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
-from tracking3d.estimation.gap import Gap, ModelCoverage
+from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoEstimates, PhotoSet
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.solver import (
     ContinuingSolver,
     ExtendingSolver,
     GuidedSolver,
     LiveSolver,
+    PhotoSolver,
     RefiningSolver,
     Solver,
     State,
@@ -154,6 +155,23 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         return (
             state if not isinstance(self._solver, ExtendingSolver) else self._solver.start_from(state, poses)
         )
+
+    def has_points(self, state: State, ended: bool) -> bool:
+        """See `PhotoSolver.has_points`."""
+        return not isinstance(self._solver, PhotoSolver) or self._solver.has_points(state, ended)
+
+    def start_from_photos(self, state: State, photos: PhotoSet) -> tuple[State, PhotoEstimates]:
+        """See `PhotoSolver.start_from_photos`; the estimates' masks are those of the pinhole camera."""
+        if not isinstance(self._solver, PhotoSolver):
+            return state, PhotoEstimates((), "")
+
+        def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
+            return ((self._frame(frame), self._mask(mask)) for frame, mask in photos.read(indices))
+
+        begun: tuple[State, PhotoEstimates] = self._solver.start_from_photos(
+            state, replace(photos, read=read)
+        )
+        return begun
 
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]

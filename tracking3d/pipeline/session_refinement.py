@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed
-from tracking3d.estimation.gap import Gap, ModelCoverage
+from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoSet
 from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.solver import (
     ContinuingSolver,
     ExtendingSolver,
     GuidedSolver,
+    PhotoSolver,
     RefiningSolver,
     Solver,
 )
@@ -158,6 +159,36 @@ class SessionRefinement:
         poses = {index: np.asarray(one.T_cam_obj, np.float64) for index, one in found.items()}
         confidence = {index: one.confidence for index, one in found.items()}
         return Attempt(state, order, poses, confidence)
+
+    def lacks_points(self, ended: bool) -> bool:
+        """Whether there is no map with points, and the solver could start from photos; see `PhotoSolver`."""
+        solver = self._solver
+        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+            return False
+        with self._settings.in_force():
+            return not solver.has_points(self._state, ended)
+
+    def start_from_photos(self, photos: PhotoSet) -> tuple[Attempt | None, str]:
+        """Join the frames as photos, in whatever order; see `PhotoSolver`.
+
+        Returns:
+            What it comes to, None if nothing does; and which photos are not joined, in words.
+        """
+        solver = self._solver
+        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+            return None, ""
+        try:
+            with self._settings.in_force(), measure("map") as watch:
+                state, made = solver.start_from_photos(self._state, photos)
+        except PluginFailure:
+            return None, ""
+        self.refining += watch.times
+        if not made.estimates:
+            self._state = state
+            return None, made.reason
+        poses = {one.index: np.asarray(one.T_cam_obj, np.float64) for one in made.estimates}
+        confidence = {one.index: one.confidence for one in made.estimates}
+        return Attempt(state, FrameOrder(min(poses)), poses, confidence), made.reason
 
     def adopt(self, attempt: Attempt) -> None:
         """Continue with another start in place of the first one."""

@@ -93,10 +93,12 @@ class StartOfModel:
     Attributes:
         frame: Index of the frame.
         reason: Why it started there, in words.
+        advice: Of photos, which could not be joined, and what to do about that; empty if all were.
     """
 
     frame: int
     reason: str
+    advice: str = ""
 
 
 def refinement(
@@ -124,7 +126,9 @@ def refinement(
     return {
         "state": state,
         "reason": reason,
-        "start": None if start is None else asdict(start),
+        "start": None
+        if start is None
+        else {key: value for key, value in asdict(start).items() if value != ""},
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
         "kept_refined": kept if refined else 0,

@@ -34,10 +34,12 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     """
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
     counted = (run.get("prompt") or {}).get("frames") is not None
+    advice = ((run.get("refinement") or {}).get("start") or {}).get("advice", "")
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
-        *describe_camera_and_model(run["camera"], model),
+        *([advice] if advice else ()),
+        *describe_camera_and_model(run["camera"], None if advice else model),
     ]
 
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
+from tracking3d.estimation.gap import PhotoEstimates, PhotoSet
 from tracking3d.estimation.online.atlas.atlas import (
     activate_largest_map,
     activate_map,
@@ -49,6 +50,12 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import begin_again
 from tracking3d.estimation.online.initialization.initializer import restart_misfit, try_initialize, why_no_map
+from tracking3d.estimation.online.initialization.photo_start import (
+    MOST_PHOTOS,
+    initial_map_of_photos,
+    start_of_photos,
+)
+from tracking3d.estimation.online.initialization.photo_tracks import Photo
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
@@ -58,6 +65,7 @@ from tracking3d.estimation.online.mapping.object_model import object_model
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
 from tracking3d.estimation.online.masks.mask_agreement import mask_agreement
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.relocalization.keypoint_matching import poses_from_matches
 from tracking3d.estimation.online.relocalization.pose_search import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
@@ -67,11 +75,12 @@ from tracking3d.estimation.online.tracking.motion_model import (
     advance,
     pose_predictions,
 )
+from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale
 from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
 from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.rendering import TexelMap
@@ -211,6 +220,59 @@ class OnlineSolver(MapInitialization):
             updated, initial_estimate(frame, binary, found.fit.pose, state.camera), found
         )
         return updated, replace(mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
+
+    def has_points(self, state: SolverState, ended: bool) -> bool:
+        """See `tracking3d.estimation.solver.PhotoSolver`."""
+        if state.phase is SolverPhase.INITIALIZING:
+            start = try_initialize(state, self.online, ended=True)[1] if ended else None
+            return start is not None and not start.object_map.pointless
+        maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
+        return not all(one.pointless for one in maps)
+
+    def start_from_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
+        """See `tracking3d.estimation.solver.PhotoSolver`."""
+        places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
+        chosen = [photos.indices[place] for place in places.round().astype(int)]
+        begun: SolverState | None = None
+        found, waiting = list[Photo](), list[tuple[Keyframe, FrameEstimate]]()
+        for frame, mask in photos.read(chosen):
+            frame, binary = mask.on(frame), mask.found
+            if binary is None:
+                continue
+            if begun is None:
+                begun, _ = self._first_state(frame, binary, self.camera, state.feature_space)
+            depth = first_translation(mask_ellipse(binary), self.camera)
+            pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=self.device))
+            view = self._view(begun, frame, binary, pose, FollowedPoints.none())
+            waiting.append((view, initial_estimate(frame, binary, pose, self.camera)))
+            found.append(Photo.of(frame.index, grey(frame.image), binary))
+        start = start_of_photos(found, self.camera)
+        if begun is None or start.structure is None:
+            return replace(state, waiting_reason=start.reason), PhotoEstimates((), start.reason)
+        weights = FitWeights(smoothness=self.online.smoothness)
+        views = [view for view, _ in waiting]
+        made, shown = initial_map_of_photos(begun.object_map, start, found, views, self.camera, weights)
+        pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
+        begun, last = self._initialize(replace(begun, pending=pending), made)
+        estimates = [*last.revised, replace(last, revised=())]
+        rest = sorted(set(photos.indices) - set(chosen))
+        estimates += [
+            self._find_photo(begun, frame, mask) for frame, mask in (photos.read(rest) if rest else ())
+        ]
+        return begun, PhotoEstimates(tuple(estimates), start.reason)
+
+    def _find_photo(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
+        """A photo that was not joined, by its matches with the nearest ones that were; lost if there are too few."""
+        pose, binary = state.last_pose[0], mask.found
+        nearest = sorted(state.object_map.keyframes, key=lambda view: abs(view.index - frame.index))
+        matched = []
+        if binary is not None:
+            [keypoints] = Photo.of(frame.index, grey(frame.image), binary).keypoints
+            scale = pixel_scale(nearest[0])
+            matched = poses_from_matches(state.object_map, state.camera, keypoints, nearest[:4], scale)
+        estimate = initial_estimate(frame, binary, matched[0][0] if matched else pose, state.camera)
+        decisive = bool(matched) and len(matched[0][1]) >= ENOUGH_POINTS
+        return replace(estimate, confidence=TRACKED_CONFIDENCE if decisive else 0.0)
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 _MAX_KEYPOINTS = 250  # most keypoints of a frame
 _CONTRAST = 0.02  # half of OpenCV's default, for the faint texture of small objects
-_SIZE = 200  # length in pixels to which the object's longer side is scaled, by a factor from 0.5 to 2
+_SIZE = 200  # length in pixels to which the object's longer side is scaled
+_SMALLEST = (
+    100  # pixels; the longer side is scaled up as if it had at least so many, and down by the same factor
+)
 _BORDER = 8  # pixels around the object that descriptors may use
 _RATIO = 0.8  # ratio of the distances to the best and the second-best match, Lowe 2004, section 7.1
 _SAME_CORNER = 2.0  # pixels within which keypoints are one corner, at several scales and orientations
@@ -38,7 +41,12 @@ class Keypoints:
 
 
 def detect(
-    image: NDArray[np.uint8], mask: NDArray[np.bool_], length: float | None = None, most: int = _MAX_KEYPOINTS
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    length: float | None = None,
+    most: int = _MAX_KEYPOINTS,
+    size: float = _SIZE,
+    contrast: float = _CONTRAST,
 ) -> Keypoints:
     """The strongest keypoints inside a mask, with the object scaled to a fixed size.
 
@@ -47,6 +55,8 @@ def detect(
         mask: ``(H, W)``.
         length: Longer side of the object in pixels, if the mask is not the object's.
         most: The most keypoints.
+        size: Length in pixels to which the object's longer side is scaled.
+        contrast: The least contrast of a keypoint, as OpenCV counts it.
     """
     if not mask.any():
         return Keypoints.none()
@@ -54,23 +64,28 @@ def detect(
     corner = np.array([max(x - _BORDER, 0), max(y - _BORDER, 0)])
     box = slice(corner[1], y + height + _BORDER), slice(corner[0], x + width + _BORDER)
     original = np.array(image[box].shape[::-1])
-    scale = float(np.clip(_SIZE / (length or max(width, height)), 0.5, 2.0))
+    scale = float(np.clip(size / (length or max(width, height)), _SMALLEST / size, size / _SMALLEST))
     # If the size is given instead of a factor, OpenCV scales by exactly the ratio of the sizes.
-    size = np.rint(scale * original).astype(int).tolist()
-    crop = cv2.resize(image[box], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    inside = cv2.resize(mask[box].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    scaled = np.rint(scale * original).astype(int).tolist()
+    crop = cv2.resize(image[box], scaled, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    inside = cv2.resize(mask[box].astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
     # Without the precise upscale, all keypoints are a quarter of a pixel too far right and down.
-    sift = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(most, contrastThreshold=contrast, enable_precise_upscale=True)
     found, descriptor = sift.detectAndCompute(crop, inside)
     if not len(found):
         return Keypoints.none()
     place = np.array([point.pt for point in found])
-    pixel = (place + 0.5) * original / size - 0.5 + corner
+    pixel = (place + 0.5) * original / scaled - 0.5 + corner
     return Keypoints(pixel.astype(np.float32), np.asarray(descriptor, dtype=np.float32))
 
 
-def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
+def match(a: Keypoints, b: Keypoints, ratio: float = _RATIO) -> NDArray[np.int64]:
     """Mutual nearest neighbours that pass the ratio test against keypoints elsewhere in ``b``.
+
+    Args:
+        a: Keypoints of one frame.
+        b: Those of another.
+        ratio: The largest ratio of the distances to the match and to the nearest keypoint elsewhere.
 
     Returns:
         ``(K, 2)`` indices into ``a`` and ``b``, each at most once.
@@ -84,7 +99,7 @@ def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
     distance, best = distance[mutual], best[mutual]
     gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
     elsewhere = np.where(gap < _SAME_CORNER, np.inf, distance).min(1)
-    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < _RATIO * elsewhere)
+    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < ratio * elsewhere)
     return np.stack([mutual[clear], best[clear]], 1)
 
 

@@ -1,0 +1,137 @@
+"""Folders of photos in wide steps become one model, and what cannot be joined is told."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from resumable_runs import Stopped, assert_alike, settings, stop_at
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.gap import PhotoEstimates
+from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.evaluation.metrics import aligned_rotation_errors
+from tracking3d.pipeline import lost_frames
+from tracking3d.pipeline.record import record
+from tracking3d.results.files import write_image
+from tracking3d.results.notes import notes_of_run
+from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.video import open_source
+
+
+@cache
+def turntable() -> SyntheticClip:
+    return synthesize(
+        SyntheticSpec(
+            shape="ellipsoid", frames=8, size=(320, 240), degrees_per_frame=20.0, axis=(0.0, -1.0, 0.25),
+            drift=(0.0, 0.0, 0.0), fill=0.85, supersample=1,
+        )
+    )  # fmt: skip
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A folder of photos, and the configuration with their masks."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index, image in enumerate(turntable().images):
+        write_image(folder / f"{index:03d}.png", image)
+    np.save(tmp_path / "masks.npy", turntable().masks)
+    return folder, settings(
+        "tracker.name=precomputed",
+        f"tracker.path={tmp_path / 'masks.npy'}",
+        "crop.size=64",
+        "object.frequency=4",
+    )
+
+
+def start_of(run: RunReader) -> dict:
+    return json.loads((run.folder / "run.json").read_text())["refinement"]["start"]
+
+
+@pytest.mark.slow
+def test_a_turntable_in_steps_of_twenty_degrees_is_tracked(photos, tmp_path):
+    folder, config = photos
+    run = record(open_source(str(folder)), config, tmp_path / "run")
+    found = np.stack([frame.T_cam_obj[:3, :3] for frame in run.frames])
+    assert aligned_rotation_errors(found, turntable().T_cam_obj[:, :3, :3]).max() < 3
+    assert "joined as photos" in start_of(run)["reason"]
+    assert "advice" not in start_of(run)
+    assert sum(frame.status is Status.TRACKED for frame in run.frames) >= 6
+
+
+@pytest.mark.slow
+def test_photos_that_cannot_be_joined_are_named_and_nobody_asks_to_film(photos, tmp_path, monkeypatch):
+    folder, config = photos
+    advice = "8 photos, none joined; photo 3 shares too few points with photos 2 and 4"
+    monkeypatch.setattr(
+        OnlineSolver, "start_from_photos", lambda self, state, photos: (state, PhotoEstimates((), advice))
+    )
+    run = record(open_source(str(folder)), config, tmp_path / "run")
+    notes = json.loads((run.folder / "run.json").read_text())["notes"]
+    assert advice in notes
+    assert not any("film" in note for note in notes)
+    assert start_of(run)["advice"] == advice
+
+
+def needs(statuses: list[Status], fps: float | None, lacks_points: bool) -> bool:
+    """Whether photos are joined after causal estimates of these statuses."""
+    causal = {index: SimpleNamespace(status=status) for index, status in enumerate(statuses)}
+    masks = SimpleNamespace(estimates=SimpleNamespace(causal=causal), has_mask=lambda index: True)
+    session = SimpleNamespace(lacks_points=lambda ended: lacks_points)
+    return lost_frames.needs_photo_start(session, SimpleNamespace(fps=fps), masks)
+
+
+GOOD, BAD = [Status.TRACKED] * 8, [Status.UNCERTAIN] * 5 + [Status.TRACKED] * 3
+
+
+@pytest.mark.parametrize(
+    ("statuses", "fps", "lacks_points", "needed"),
+    [
+        (GOOD, None, False, False),
+        (GOOD, 30.0, False, False),
+        (BAD, None, False, True),  # images without times, few of which are tracked
+        (BAD, 30.0, False, False),  # a video has its other starts
+        (BAD, 30.0, True, True),
+        (GOOD, None, True, True),
+        (BAD[:3], None, True, False),  # three photos are no set
+    ],
+)
+def test_photos_are_joined_if_there_is_no_map_with_points_or_few_of_them_are_tracked(
+    statuses, fps, lacks_points, needed
+):
+    assert needs(statuses, fps, lacks_points) is needed
+
+
+def test_a_start_that_explains_no_more_than_there_is_stays_out():
+    causal = {index: SimpleNamespace(status=status) for index, status in enumerate(GOOD)}
+    masks = SimpleNamespace(estimates=SimpleNamespace(causal=causal), has_mask=lambda index: True)
+    attempt = SimpleNamespace(confidence=dict.fromkeys(range(8), 0.9), poses=dict.fromkeys(range(8)))
+    session = SimpleNamespace(
+        start_from_photos=lambda photos: (attempt, ""), adopt=lambda attempt: pytest.fail("no better")
+    )
+    assert lost_frames.start_from_photos(session, None, masks) == (None, "")
+
+
+def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
+    advice = "8 photos, none joined; photo 3 shares too few points with photos 2 and 4"
+    camera = {"assumed": False, "origin": ""}
+    run = {"source_notes": [], "camera": camera, "refinement": {"start": {"advice": advice}}}
+    unseen = SimpleNamespace()  # a model that would be asked for what was never seen
+    assert notes_of_run(run, unseen, []) == [advice]
+
+
+@pytest.mark.slow
+def test_a_run_killed_while_photos_are_joined_is_resumed_with_the_same_answers(photos, tmp_path, monkeypatch):
+    folder, config = photos
+    record(open_source(str(folder)), config, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_at(patch, OnlineSolver, "start_from_photos", 0)
+        with pytest.raises(Stopped):
+            record(open_source(str(folder)), config, tmp_path / "run")
+    record(open_source(str(folder)), config, tmp_path / "run", resume=True)
+    assert_alike(tmp_path / "run", tmp_path / "whole")
