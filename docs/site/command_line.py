@@ -36,7 +36,7 @@ Commands that take longer than a moment say on the standard error what they are 
 on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 
 `synth`, `evaluate` and `bench`, with which trackers are measured, are on
-[a page of the repository](../benchmarks/command-line.md); [measures](measures.md) begins with them.
+[a page of the repository](../benchmarks/command-line.md); [measures](../benchmarks/measures.md) begins with them.
 
 | exit code | |
 |---|---|

@@ -200,5 +200,5 @@ def test_run_folder_page_names_every_file_and_key():
 
 
 def test_measures_page_names_every_key():
-    page = (ROOT / "docs/measures.md").read_text(encoding="utf-8")
+    page = (ROOT / "benchmarks/measures.md").read_text(encoding="utf-8")
     assert [key for key in Scores.__dataclass_fields__ if f"`{key}`" not in page] == []

@@ -7,8 +7,10 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from documentation_pages import HOW_TO, blocks, commands, label
+from PIL import Image
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
@@ -35,6 +37,8 @@ def test_a_page_works_from_top_to_bottom(page: Path, filmed, tmp_path, monkeypat
     box = ",".join(f"{round(side)}" for side in filmed.box)
     for name in {name for line in lines for name in re.findall(r"[\w/]+\.mp4", line)}:
         film(filmed, Path(name))
+    if any("run photos " in line for line in lines):
+        photograph(filmed)
     for line in lines:
         line = re.sub(BOX, f"--box {box}", line)
         line = re.sub(r"(--correct \d+):[\d,]+", rf"\1:{box}", line)
@@ -58,9 +62,17 @@ def film(clip, path: Path) -> None:
             writer.write(image)
 
 
+def photograph(clip) -> None:
+    """The frames and masks as folders of images."""
+    for folder, images in ("photos", clip.images), ("masks", 255 * clip.masks.astype(np.uint8)):
+        Path(folder).mkdir()
+        for index, image in enumerate(images):
+            Image.fromarray(image).save(f"{folder}/{index:02}.png")
+
+
 def test_every_page_has_commands_and_says_what_comes_out():
     assert [page.stem for page in HOW_TO] == [
-        "composite", "known-object", "robot-arm", "scan", "splat",
+        "composite", "known-object", "robot-arm", "scan", "splat", "turntable-photos",
     ]  # fmt: skip
     for page in HOW_TO:
         lines = commands(page, "tracking3d")
