@@ -85,7 +85,15 @@ def test_all_that_can_be_used_is_reached_by_keyboard_and_its_focus_is_seen(brows
             assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") in ("solid", "auto")
             if reached[-1] == "SUMMARY":
                 break
-        assert reached[:7] == ["slider", "play", "before", "after", "model", "follow", "spin"]
+        assert [name for name in reached if name != "A"][:7] == [
+            "slider",
+            "play",
+            "before",
+            "after",
+            "model",
+            "follow",
+            "spin",
+        ]
         assert "SUMMARY" in reached
 
 

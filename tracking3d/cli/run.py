@@ -176,7 +176,7 @@ def _command() -> str:
     """The command line, for the record; without the passwords in it."""
     from tracking3d.video.addresses import without_password
 
-    return shlex.join(map(without_password, sys.argv))
+    return shlex.join(["tracking3d", *map(without_password, sys.argv[1:])])
 
 
 def _ask_in_browser(
