@@ -74,7 +74,7 @@ def pick(
     menu = settings_menu(source, frames, tracking, camera, settings, _configure)
     with show_progress(quiet):  # plug-ins are imported to check their options
         config = menu.configure(menu.chosen)
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    load_with_progress("tracking3d.pipeline.record", quiet)
     if view:
         from tracking3d.viewer.opening import check_viser
 
@@ -83,6 +83,7 @@ def pick(
 
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite, menu)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     prompts = prompts_of(picked)
     options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
     request = RunRequest(source, picked.config or config, folder, prompts, options)
@@ -199,6 +200,7 @@ def picked_in_browser(
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
     from tracking3d.results.overwrite import check_output_folder
+    from tracking3d.speed.kernels_ahead import compile_in_background
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.selection import within
@@ -212,6 +214,7 @@ def picked_in_browser(
         raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")
     images = frame_images(opened)
     indices = within(selection, images.count or opened.count or 1)
+    compile_in_background()
     session = PickingSession(source, images, indices, settings, menu)
 
     def save(picked: Picked) -> tuple[str, str]:

@@ -84,7 +84,7 @@ def run(
                 "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
                 "--masks DIR, or draw it with `tracking3d pick`."
             )
-        load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+        load_with_progress("tracking3d.pipeline.record", quiet)
         configure = partial(_configure_in_browser, prompt, output, performance)
         menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
         prompts, config = _ask_in_browser(source, folder, video.frames, output.overwrite, menu)
