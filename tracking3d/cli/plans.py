@@ -41,14 +41,16 @@ def plan_run(
         return []
     made = frames - kept
     count, refines = made * objects, config.get("solver", {}).get("final_refine")
-    first = 0.15 * kept if kept else 10.0  # the mask tracker sees them again, or the first map is made
+    first = 0.07 * kept if kept else 10.0  # the mask tracker sees them again, or the first map is made
+    # Around the frames that are made again, others that stand are looked at, too.
+    poses, evidence, masks = (0.33, 0.2, 0.24) if kept else (0.11, 0.025, 0.09)
     plan = [PlannedStage("tracking", first * objects + 0.33 * count, frames)]
     if refines:
         plan += objects * [PlannedStage("refining the map", 2.0)]
-        plan += [PlannedStage("refining frames", 0.11 * count, made)]
+        plan += [PlannedStage("refining frames", poses * count, made)]
         plan += objects * _plan_landmarks(frames) if made > kept else []
-        plan += [PlannedStage("collecting masks", (0.1 if kept else 0.025) * count, made)]
-        plan += [PlannedStage("refining masks", 0.09 * count, made)]
+        plan += [PlannedStage("collecting masks", evidence * count, made)]
+        plan += [PlannedStage("refining masks", masks * count, made)]
         plan += objects * _FIRST_TEXTURE
     shape = config.get("object", {}).get("shape")
     if shape == "fine" or (shape == "auto" and refines):
