@@ -23,6 +23,7 @@ from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
+    from tracking3d.picker.server import PageProgress
     from tracking3d.results.records import FrameRecord
 
 _EVERY = 10.0
@@ -39,6 +40,8 @@ class ProgressDisplay:
         self._began = time.monotonic()
         self._progress = StageProgress(_STARTING)
         self._part = self._detail = ""
+        self._share = 0.0
+        self._frame: int | None = None
 
     def expect(self, plan: Sequence[PlannedStage]) -> None:
         """Estimate the remaining time by these stages from here on."""
@@ -54,7 +57,22 @@ class ProgressDisplay:
 
     def show_frame(self, frame: FrameRecord | SkippedFrame) -> None:
         """Show what came of a frame: a listener for `tracking3d.pipeline.record`."""
-        self._detail = _describe(frame)
+        self._detail, self._frame = _describe(frame), frame.index
+
+    def progress(self) -> PageProgress:
+        """The same for a page."""
+        from tracking3d.picker.server import PageProgress
+
+        now = time.monotonic()
+        sentence = f"{self._stage}, {self._time(now)}"
+        return PageProgress(True, sentence, share=self._measure(now), frame=self._frame)
+
+    def _measure(self, now: float) -> float | None:
+        """The share that is done; None as long as nothing tells."""
+        left = self._remaining.seconds(now)
+        if left is not None:  # what takes longer than expected holds the bar, and does not move it back
+            self._share = max(self._share, (now - self._began) / (now - self._began + left))
+        return None if left is None else self._share
 
     @property
     def _stage(self) -> str:
@@ -95,7 +113,6 @@ class _Line(ProgressDisplay):
             transient=True,
         )
         self._bar.before_drawing = self._refresh
-        self._share = 0.0
         self._task = self._bar.add_task(_STARTING, total=None, time="", detail="")
 
     def __enter__(self) -> None:
@@ -106,13 +123,11 @@ class _Line(ProgressDisplay):
 
     def _refresh(self) -> None:
         now = time.monotonic()
-        left = self._remaining.seconds(now)
-        if left is not None:  # what takes longer than expected holds the bar, and does not move it back
-            self._share = max(self._share, (now - self._began) / (now - self._began + left))
+        share = self._measure(now)
         self._bar.update(
             self._task,
             description=self._stage,
-            total=None if left is None else 1.0,
+            total=None if share is None else 1.0,
             completed=self._share,
             time=self._time(now),
             detail=self._detail,

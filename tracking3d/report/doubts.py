@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, ObjectModel, Status
+from tracking3d.results.description import for_new_folder
 from tracking3d.results.doubtful_frames import count_reasons
 from tracking3d.results.layout import has_state
 from tracking3d.results.notes import MOSTLY, is_lens_uncertain, unseen_share
@@ -82,7 +83,8 @@ def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
     if not command.startswith("tracking3d run "):  # a batch, or Python
         source = shlex.quote(str(run.description.get("source", "VIDEO")))
         command = f"tracking3d run {source} --box X,Y,WIDTH,HEIGHT"
-    again = f"{command.replace(' --resume', '')} --out {shlex.quote(f'{run.folder}_again')}"
+    command = for_new_folder(command)
+    again = f"{command} --out {shlex.quote(f'{run.folder}_again')}"
     steps = []
     if run.state not in ("finished", "running") and has_state(run.folder):
         steps.append(Advice("Continue the run from where it stopped.", (f"{command} --resume",)))
