@@ -276,6 +276,16 @@ def test_a_correction_that_fails_says_how_to_go_on(call, clip, script):
     assert Path("run/run.json").read_bytes() == before
 
 
+def test_a_damaged_state_gets_one_piece_of_advice(call, refused, clip, script):
+    script.faults[3] = KeyboardInterrupt()
+    call("run", clip, *BOX, "--out", "run")
+    for state in Path("run/.state").glob("*.json*"):
+        state.write_text("{}")
+    script.faults.clear()
+    line = refused("run", clip, *BOX, "--out", "run", "--resume")  # one line
+    assert "--overwrite" in line and "--resume" not in line
+
+
 def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):
     script.faults[2] = PluginError("The tracker gave up.")
     result = call("run", clip, *BOX, "--out", "run")

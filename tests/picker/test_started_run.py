@@ -13,7 +13,7 @@ from test_picker_in_browser import SHOWN, drag
 from test_picker_server import BOX, body, post, whole
 
 from tracking3d.picker import server as server_module
-from tracking3d.picker.server import Picker, PageProgress, ShownRun
+from tracking3d.picker.server import PageProgress, Picker, ShownRun
 from tracking3d.results import layout
 
 
@@ -97,17 +97,21 @@ def test_a_person_sees_the_run_go_on_and_end(picker, run, monkeypatch):
         page.click("#start")
         picker.wait()
         picker.run = ShownRun(
-            [run], lambda: PageProgress(True, "tracking 3/6", share=0.4, frame=2), lambda: ""
+            [run],
+            lambda: PageProgress(True, "tracking 3/6", share=0.4, frame=2),
+            lambda: f"{picker.address}picker.css",
         )
         page.wait_for_selector("#status:has-text('tracking 3/6')")
         assert page.evaluate("document.getElementById('progress').value") == pytest.approx(0.4)
         assert page.is_hidden("#tools") and page.is_visible("#viewer")
         while page.evaluate("[frame, (veils ?? []).length].join()") != "2,1":
             page.wait_for_timeout(50)
+        page.click("#viewer")
+        page.wait_for_selector("#links a[href$='picker.css']:has-text('Viewer')")
         page.click("#stop")
         end(picker)
         page.wait_for_selector("#status:has-text('The run is finished')")
-        page.wait_for_selector("#reports a:has-text('Report')")
+        page.wait_for_selector("#links a:has-text('Report')")
         assert page.is_hidden("#stop") and page.is_hidden("#progress") and stops == [True]
 
 

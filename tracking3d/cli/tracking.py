@@ -15,11 +15,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tracking3d.results.description import for_new_folder
-
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.picker.server import Picker, PageProgress
+    from tracking3d.picker.server import PageProgress, Picker
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.prompts.corrections import Correction
     from tracking3d.prompts.prompt import PromptSet
@@ -90,7 +88,7 @@ def track(request: RunRequest, display: RunDisplay) -> None:
     folders = object_folders(folder, objects) if objects > 1 else [folder]
     finished = {one: times_written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
-        ends.enter_context(resumable(folders, options.command))
+        ends.enter_context(resumable(folders, options))
         plan = plan_run(request.config.model_dump(), source.count, objects, display.report)
         shown = ends.enter_context(show_progress(display.quiet, plan))
         reporting = ends.enter_context(report_at_end(folders if display.report else []))
@@ -155,15 +153,18 @@ def a_person_is_there() -> bool:
 
 
 @contextmanager
-def resumable(folders: list[Path], command: str | None = None) -> Iterator[None]:
+def resumable(folders: list[Path], options: RecordOptions) -> Iterator[None]:
     """If a run is stopped, say how to continue it, if it can be continued: by its command."""
+    from tracking3d.errors import InputError
+    from tracking3d.results.description import for_new_folder
     from tracking3d.results.layout import CORRECTING, has_state
 
     try:
         yield
     except BaseException as error:
-        if any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
-            error.add_note(f"To continue from there: {for_new_folder(command or '')} --resume")
+        refused = options.resume and isinstance(error, InputError)  # it would be refused again
+        if not refused and any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
+            error.add_note(f"To continue from there: {for_new_folder(options.command or '')} --resume")
         raise
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.picker.drawing import parse_object
-from tracking3d.picker.server import Picker, PageProgress, ShownRun
+from tracking3d.picker.server import PageProgress, Picker, ShownRun
 from tracking3d.picker.session import PickingSession
 from tracking3d.web.access import Access
 

@@ -26,6 +26,7 @@ let asked = 0; // number of the last question for a mask
 let present = null; // the mask that the run has of this frame, if a run is corrected
 let running = false; // whether the run is being corrected
 let veils = null; // the masks of the run's latest frame, once it has started
+let viewer = null; // its address, once it is open
 let stopped = false; // whether it was stopped from here
 
 const one = () => objects[current];
@@ -478,17 +479,19 @@ async function showLatest(told) {
   }
 }
 
+function link(address, text) {
+  const line = document.createElement("div");
+  line.append(Object.assign(document.createElement("a"), { href: address, target: "_blank", textContent: text }));
+  return line;
+}
+
 function showRun(told) {
   if (told.frame !== null) showLatest(told);
   byId("stop").hidden = !told.running;
-  byId("viewer").hidden = !told.viewer || (told.running && told.frame === null);
-  byId("reports").replaceChildren(...told.reports.map((address, number) => {
-    const name = told.reports.length > 1 ? `Report of ${objects[number]?.name ?? `object ${number + 1}`}` : "Report";
-    const link = Object.assign(document.createElement("a"), { href: address, target: "_blank", textContent: name });
-    const line = document.createElement("div");
-    line.append(link);
-    return line;
-  }));
+  byId("viewer").hidden = viewer || !told.viewer || (told.running && told.frame === null);
+  const name = (number) => (told.reports.length > 1 ? `Report of ${objects[number]?.name ?? number}` : "Report");
+  byId("links").replaceChildren(...told.reports.map((address, number) => link(address, name(number))),
+    ...(viewer ? [link(viewer, "Viewer")] : []));
   setTimeout(follow, told.running ? 1000 : 20000); // to say that the page is still open
 }
 
@@ -497,13 +500,13 @@ byId("stop").addEventListener("click", async () => {
   await ask("stop", {}).catch(() => null);
 });
 byId("viewer").addEventListener("click", async () => {
-  const tab = window.open("", "_blank"); // later on, a browser takes it for an advertisement
+  byId("viewer").disabled = true;
   try {
-    const address = new URL((await ask("view", {})).address);
-    address.hostname = location.hostname; // the browser may know this machine by another name
-    tab.location = address;
+    viewer = new URL((await ask("view", {})).address);
+    viewer.hostname = location.hostname; // the browser may know this machine by another name
+    byId("links").append(link(viewer, "Viewer"));
+    byId("viewer").hidden = true;
   } catch (error) {
-    tab.close();
     say(error.message, true);
   }
 });
