@@ -37,6 +37,30 @@ def test_a_stage_of_which_no_step_comes_has_begun():
     assert heard == [StageProgress("texture", 0, 0)]
 
 
+def test_what_reports_within_a_step_is_a_part_of_the_stage_until_that_ends():
+    heard: list[StageProgress] = []
+    with listen_to_progress(heard.append):
+        for _ in report_each("tracking", "ab"):
+            for _ in report_each("refining poses", "c"):
+                report_progress("texture")
+            break
+        report_progress("report")
+    assert [(one.name, one.inside) for one in heard] == [
+        ("tracking", ""),
+        ("refining poses", "tracking"),
+        ("texture", "refining poses"),
+        ("refining poses", "tracking"),
+        ("report", ""),
+    ]
+
+
+def test_only_what_is_counted_is_a_step():
+    heard: list[StageProgress] = []
+    with listen_to_progress(heard.append):
+        assert list(report_each("refining frames", range(6), 2, lambda number: number > 3)) == list(range(6))
+    assert [(one.done, one.total) for one in heard] == [(0, 2), (1, 2), (2, 2)]
+
+
 def test_without_a_listener_and_outside_of_it_nobody_is_called():
     heard: list[StageProgress] = []
     report_progress("before")

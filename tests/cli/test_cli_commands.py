@@ -40,6 +40,7 @@ def test_every_command_has_help(call, command):
     assert result.exit_code == 0
     assert "Usage:" in result.stdout
     assert command not in COMMANDS or "--debug" in result.stdout
+    assert "<bool>" not in result.stdout
 
 
 def test_version(call):
@@ -219,6 +220,20 @@ def test_evaluate_names_the_folder_that_is_none(refused, finished, truth):
     assert "absent" in refused("evaluate", "absent", "--truth", truth)
     assert "absent" in refused("evaluate", finished, "--truth", "absent")
     assert "--truth" in refused("evaluate", finished)
+
+
+def test_points_are_a_table_on_a_terminal(finished, monkeypatch, capsys):
+    from tracking3d.cli.points import _print
+    from tracking3d.results.correspondences import track_points
+    from tracking3d.results.run_reader import RunReader
+
+    tracks = track_points(RunReader(finished), 0, [(31.5, 23.5)])
+    _print(tracks, as_json=False)
+    assert capsys.readouterr().out.startswith("frame,point,x,y")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    _print(tracks, as_json=False)
+    shown = capsys.readouterr().out
+    assert "frame,point" not in shown and "┃" in shown
 
 
 def test_points_are_followed_as_csv_and_json(call, finished):

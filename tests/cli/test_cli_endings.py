@@ -88,7 +88,7 @@ def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
     first, kept, advice = result.stderr.splitlines()[-3:]
     assert first.startswith("error: there is not enough memory; lower --size (window.size)")
     assert kept == "The frames finished until then are in run."
-    assert advice == "To continue from there, repeat the command with --resume."
+    assert advice.startswith("To continue from there: tracking3d ") and advice.endswith(" --resume")
     assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
 
 

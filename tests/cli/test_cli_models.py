@@ -83,8 +83,9 @@ def test_get_asks_for_the_licence_to_be_accepted(call, refused, catalogue):
 def test_get_takes_several_and_goes_on_after_one_that_fails(call, catalogue):
     (catalogue / "closed.onnx").parent.mkdir(parents=True)
     (catalogue / "closed.onnx").write_bytes(BYTES)
-    result = call("models", "get", "open", "closed")
+    result = call("models", "get", "open", "open", "closed")
     assert result.exit_code == 2
+    assert result.stderr.count("open could not be downloaded") == 1
     assert result.stdout == f"{catalogue / 'closed.onnx'}: closed, mine\n"
     assert "open could not be downloaded" in result.stderr
 

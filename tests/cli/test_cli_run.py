@@ -172,14 +172,18 @@ def test_box_partly_outside_is_clipped_and_the_run_goes_on(call, clip, script, c
     assert "extends beyond the frame" in caplog.text
 
 
-def test_interrupted_run_keeps_what_was_finished(call, clip, script):
+def test_interrupted_run_keeps_what_was_finished_and_its_whole_command_continues_it(
+    call, clip, script, monkeypatch
+):
     script.faults[3] = KeyboardInterrupt()
-    result = call("run", clip, *BOX, "--out", "run")
+    line = ["run", "a clip", *BOX, "--overwrite", "--out", "run"]
+    monkeypatch.setattr("sys.argv", ["/somewhere/tracking3d", *line])
+    result = call(*line[:1], clip, *line[2:])
     assert result.exit_code == 130
     assert result.stderr.splitlines() == [
         "interrupted",
         "The frames finished until then are in run.",
-        "To continue from there, repeat the command with --resume.",
+        f"To continue from there: tracking3d run 'a clip' {' '.join(BOX)} --out run --resume",
     ]
     run = RunReader(Path("run"))
     assert run.state == "interrupted"
@@ -272,15 +276,23 @@ def test_a_correction_that_fails_says_how_to_go_on(call, clip, script):
     assert Path("run/run.json").read_bytes() == before
 
 
+def test_a_damaged_state_gets_one_piece_of_advice(call, refused, clip, script):
+    script.faults[3] = KeyboardInterrupt()
+    call("run", clip, *BOX, "--out", "run")
+    for state in Path("run/.state").glob("*.json*"):
+        state.write_text("{}")
+    script.faults.clear()
+    line = refused("run", clip, *BOX, "--out", "run", "--resume")  # one line
+    assert "--overwrite" in line and "--resume" not in line
+
+
 def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):
     script.faults[2] = PluginError("The tracker gave up.")
     result = call("run", clip, *BOX, "--out", "run")
     assert result.exit_code == 2
-    assert result.stderr.splitlines() == [
-        "error: The tracker gave up.",
-        "The frames finished until then are in run.",
-        "To continue from there, repeat the command with --resume.",
-    ]
+    *told, advice = result.stderr.splitlines()
+    assert told == ["error: The tracker gave up.", "The frames finished until then are in run."]
+    assert advice.startswith("To continue from there: tracking3d ") and advice.endswith(" --resume")
     description = json.loads(Path("run/run.json").read_text())
     assert (description["state"], description["error"]) == ("failed", "The tracker gave up.")
     assert len(RunReader(Path("run")).frames) == 2

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,44 @@ import pytest
 from tracking3d.cli import pick as pick_module
 from tracking3d.cli import run as run_module
 from tracking3d.cli import view as view_module
+from tracking3d.cli.tracking import RunRequest
+from tracking3d.config.loading import load_config
 from tracking3d.picker.drawing import DrawnObject
+from tracking3d.picker.outcome import read_outcome, save_outcome
 from tracking3d.picker.session import Picked
+from tracking3d.pipeline.record import RecordOptions
+from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results.run_reader import RunReader
 from tracking3d.viewer import opening
+from tracking3d.web.access import Access
 
 BOX = ("--box", "20,10,20,20")
+
+
+class Page:
+    """Stands in for the page on which the object is picked."""
+
+    access, address = Access(), "http://127.0.0.1:8090/"
+
+    def __init__(self, drawn: Picked, before: bool = False) -> None:
+        self._drawn, self.picked = drawn, drawn if before else None
+        self.shown: list[object] = []
+
+    def __setattr__(self, name, value):
+        if name == "run":
+            self.shown.append(value.progress())
+        super().__setattr__(name, value)
+
+    def wait(self) -> Picked:
+        return self._drawn
+
+    def wait_until_left(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
 CUP = DrawnObject(name="cup", colour="#00a5e0", frame=2, box=(20, 10, 20, 20))
 
 
@@ -127,11 +160,11 @@ def terminal(monkeypatch):
 def test_run_without_an_object_picks_where_a_person_is_there(call, clip, script, terminal, monkeypatch):
     asked = []
 
-    def picked(source, frames, settings, folder, overwrite=False, menu=None):
-        asked.append((source, frames, settings.tracker.name, folder))
-        return Picked(2, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)])
+    def picked(request, menu):
+        asked.append((request.source, request.options.selection, request.config.tracker.name, request.folder))
+        return Page(Picked(2, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)]))
 
-    monkeypatch.setattr(pick_module, "picked_in_browser", picked)
+    monkeypatch.setattr(run_module, "open_picker", picked)
     assert call("run", clip, "--tracker", "csrt", "--out", "run").exit_code == 0
     assert asked == [(str(clip), None, "csrt", Path("run"))]
     assert [frame.index for frame in RunReader(Path("run")).frames] == [0, 1, 2, 3, 4]
@@ -147,16 +180,51 @@ def test_who_wants_no_conversation_gets_the_sentence(refused, clip, terminal, op
 def test_pick_starts_the_run_both_ways_from_the_frame_that_was_picked_in(call, clip, script, monkeypatch):
     masks = np.zeros((2, 48, 64), bool)
     masks[:, 10:20, 30:50] = True
-    monkeypatch.setattr(
-        pick_module, "picked_in_browser", lambda *given: Picked(1, (CUP, CUP), masks=list(masks))
-    )
+    page = Page(Picked(1, (CUP, CUP), masks=list(masks)))
+    monkeypatch.setattr(pick_module, "open_picker", lambda *given: page)
     result = call("pick", clip, "--out", "run", "--frames", "0:4")
     assert result.exit_code == 0, result.output
+    assert page.shown[0].running and page.shown[0].sentence
+    assert not page.shown[-1].running and page.shown[-1].sentence == "The run is finished."
     for number in (0, 1):
         reader = RunReader(Path("run", f"object_{number}"))
         assert [frame.index for frame in reader.frames] == [0, 1, 2, 3]
         assert reader.description["selection"] == "0:4"
         assert reader.description["prompt"]["first_frame"] == 1
+
+
+def test_a_picked_run_that_was_stopped_is_continued_by_picking_again_or_by_the_line_that_is_told(
+    call, clip, script, monkeypatch
+):
+    opened = []
+
+    def open_page(request, *given):
+        drawn = Picked(2, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)], config=request.config)
+        before = read_outcome(request.folder)
+        save_outcome(drawn, request.config, request.folder, request.source)
+        opened.append(before)
+        return Page(drawn, before is not None)
+
+    monkeypatch.setattr(pick_module, "open_picker", open_page)
+    script.faults[4] = KeyboardInterrupt()
+    result = call("pick", clip, "--out", "run")
+    assert result.exit_code == 130
+    [line] = [one for one in result.stderr.splitlines() if one.startswith("To continue")]
+    assert line == (
+        f"To continue from there: tracking3d run {clip} --box 20,10,20,20 --start-frame 2 --config run/picked.yaml "
+        "--out run --resume"
+    )
+    script.faults.clear()
+    shutil.copytree("run", "kept")
+    assert call("pick", clip, "--out", "run").exit_code == 0
+    assert opened[0] is None
+    assert (opened[1].frame, opened[1].boxes) == (2, [(20.0, 10.0, 20.0, 20.0)])
+    assert opened[1].config == load_config(Path("run/picked.yaml"))
+    shutil.rmtree("run")
+    shutil.move("kept", "run")
+    assert call(*shlex.split(line.partition("tracking3d ")[2])).exit_code == 0
+    assert RunReader(Path("run")).state == "finished"
+    assert read_outcome(Path("run")) is None
 
 
 def test_pick_refuses_a_folder_with_a_run_before_anything_is_drawn(call, refused, clip, script):
@@ -175,29 +243,17 @@ def test_pick_refuses_what_does_not_wait(refused, monkeypatch):
 
 def test_the_page_of_pick_is_served_until_the_run_is_started(clip, tmp_path, monkeypatch, capfd):
     import json
-    import time
     from urllib.request import Request, urlopen
 
-    from tracking3d.config.loading import load_config
-
-    found: list[Picked] = []
-    work = threading.Thread(
-        target=lambda: found.append(
-            pick_module.picked_in_browser(str(clip), None, load_config(), tmp_path / "run", port=0)
-        )
-    )
-    work.start()
-    until, address = time.monotonic() + 30, ""
-    while not address and time.monotonic() < until:
-        time.sleep(0.05)
-        address += capfd.readouterr().err
-    base = address.strip().rstrip("/")
+    request = RunRequest(str(clip), load_config(), tmp_path / "run", PromptSet(), RecordOptions())
+    page = pick_module.open_picker(request, None, port=0)
+    base = capfd.readouterr().err.strip().rstrip("/")
     body = json.dumps({"objects": [CUP.model_dump(mode="json")]}).encode()
     headers = {"Origin": base, "Content-Type": "application/json"}
     with urlopen(Request(f"{base}/start", body, headers)) as answer:
         assert "--box 20,10,20,20" in json.loads(answer.read())["command"]
-    work.join(30)
-    assert found[0].boxes == [(20.0, 10.0, 20.0, 20.0)] and (tmp_path / "run" / "picked.json").is_file()
+    assert page.wait().boxes == [(20.0, 10.0, 20.0, 20.0)] and (tmp_path / "run" / "picked.json").is_file()
+    page.close()
 
 
 def test_the_viewer_starts_without_torch():
@@ -210,15 +266,15 @@ def test_the_viewer_starts_without_torch():
 def test_the_options_of_the_command_line_are_chosen_on_the_page_and_can_be_changed(
     call, clip, script, terminal, monkeypatch, command
 ):
-    def picked(source, frames, settings, folder, *more, overwrite=False, menu=None):
-        menu = more[-1] if more else menu
+    def picked(request, menu, *more):
         first, intrinsics = menu.chosen, (300.0, 300.0, 31.5, 23.5)
         assert (first.tracker, first.quality, first.fov) == ("csrt", "best", 30)
-        assert menu.configure(first) == settings and settings.crop.size == 192
+        assert menu.configure(first) == request.config and request.config.crop.size == 192
         chosen = first.model_copy(update={"model": "none", "fov": None, "intrinsics": intrinsics})
-        return Picked(0, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)], config=menu.configure(chosen))
+        return Page(Picked(0, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)], config=menu.configure(chosen)))
 
-    monkeypatch.setattr(pick_module, "picked_in_browser", picked)
+    for module in (pick_module, run_module):
+        monkeypatch.setattr(module, "open_picker", picked)
     options = ["--tracker", "csrt", "--quality", "best", "--fov", "30", "--out", "run"]
     assert call(command, clip, *options).exit_code == 0
     config = RunReader(Path("run")).config

@@ -75,7 +75,7 @@ def test_run_and_pick_make_the_mesh_that_was_asked_for(call, clip, script, monke
     monkeypatch.setattr("tracking3d.pipeline.record.make_final_shape", lambda *_: "")
     asked = []
     monkeypatch.setattr(
-        "tracking3d.cli.pick.picked_in_browser", lambda *given: asked.append(given[2]) or 1 / 0
+        "tracking3d.cli.pick.open_picker", lambda request, *given: asked.append(request.config) or 1 / 0
     )
     assert call("run", clip, *BOX, "--quality", "best", "--model", word, "--out", "run").exit_code == 0
     call("pick", clip, "--quality", "best", "--model", word, "--out", "picked")

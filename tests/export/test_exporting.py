@@ -259,8 +259,42 @@ def test_a_camera_cannot_be_looked_through_again(run, tmp_path):
     file = tmp_path / "live" / "run.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"source": "0"}))
     with pytest.raises(InputError, match="cannot be read again"):
-        export_run(tmp_path / "live", "colmap", tmp_path / "out")
+        export_run(tmp_path / "live", "cut-outs", tmp_path / "out")
     export_run(tmp_path / "live", "colmap", tmp_path / "out", options=ExportOptions(images=False))
+
+
+@pytest.mark.parametrize("to", ["colmap", "nerfstudio"])
+def test_what_can_do_without_images_is_exported_without_them_if_the_video_is_gone(run, tmp_path, to):
+    moved = Path(shutil.copytree(run, tmp_path / "moved"))
+    told = json.loads((moved / "run.json").read_text())
+    (moved / "run.json").write_text(json.dumps(told | {"source": "gone.mp4"}))
+    done = export_run(moved, to, tmp_path / "out")
+    assert done.note.startswith("The images are left out. The video of the run") and "source" in done.note
+    assert not (tmp_path / "out" / "images").exists()
+    assert export_run(run, to, tmp_path / "whole").note == ""
+    assert (tmp_path / "whole" / "images").is_dir()
+    with pytest.raises(InputError, match="absent"):  # one that was given has to be there
+        export_run(moved, to, tmp_path / "other", options=ExportOptions(source="absent.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("to", "options", "note"),
+    [
+        (
+            "blender",
+            {"source": "absent.mp4"},
+            "The source that was given, absent.mp4, does not exist; the export does without it.",
+        ),
+        (
+            "nerfstudio",
+            {"source": "clip", "images": False},
+            "The source that was given is not used without images.",
+        ),
+        ("blender", {}, ""),
+    ],
+)
+def test_a_video_that_was_given_in_vain_is_told(run, tmp_path, to, options, note):
+    assert export_run(run, to, tmp_path / "out", options=ExportOptions(**options)).note == note
 
 
 def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):

@@ -39,7 +39,7 @@ def test_boxes_on_a_later_frame_start_a_run_there(page, picker):
     drag(page, (5, 2), (20, 12))
     page.wait_for_selector("#objects li:nth-child(2) small:has-text('px')")
     page.click("#start")
-    page.wait_for_selector("#status:has-text('The run has started')")
+    page.wait_for_selector("#run:not([hidden])")
     picked = picker.wait()
     assert picked.frame == 4 and [one.name for one in picked.objects] == ["object", "the other"]
     assert np.allclose(picked.boxes, [(30, 20, 36, 24), (5, 2, 15, 10)], atol=0.5)

@@ -84,8 +84,8 @@ def test_a_person_chooses_another_tracker_and_another_quality(picker_with_settin
         tracker = page.locator("[data-setting=tracker]")
         assert tracker.locator("option").first.inner_text() == "default (flow)"
         page.select_option("[data-setting=quality]", "good")
-        page.wait_for_selector("#source:has-text('tracker segment')")
-        assert tracker.locator("option").first.inner_text() == "default (segment)"
+        page.wait_for_selector("#source:has-text('tracker auto')")
+        assert tracker.locator("option").first.inner_text() == "default (auto)"
         page.select_option("[data-setting=tracker]", "flow")
         page.wait_for_selector("#source:has-text('tracker flow')")
         page.wait_for_selector("#tracker-for:has-text('flow: an object on a turntable')")
@@ -96,6 +96,6 @@ def test_a_person_chooses_another_tracker_and_another_quality(picker_with_settin
         drag(page, (30, 20), (66, 44))
         page.wait_for_selector("#status:has-text('The run starts from this mask')")
         page.click("#start")
-        page.wait_for_selector("#status:has-text('The run has started')")
+        page.wait_for_selector("#run:not([hidden])")
     config = picker_with_settings.wait().config
     assert (config.tracker.name, config.camera.fov) == ("flow", None)

@@ -22,6 +22,7 @@ from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import StageProgress, listen_to_progress
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -135,6 +136,16 @@ def test_the_listener_hears_of_every_frame_in_both_passes(clip, images, tmp_path
     heard = []
     correct_run(folder, moved(clip), listener=lambda frame: heard.append((frame.index, frame.refined)))
     assert heard == [(index, again) for again in (False, True) for index in range(FRAMES)]
+
+
+def test_frames_that_keep_their_estimates_are_no_steps_of_the_stages(clip, images, tmp_path):
+    folder = run(clip, images, tmp_path / "run")
+    heard: list[StageProgress] = []
+    with listen_to_progress(heard.append):
+        correct_run(folder, moved(clip))
+    for stage, total in (("tracking", FRAMES), ("refining frames", 2), ("drawing", 2)):
+        steps = [(one.done, one.total) for one in heard if one.name == stage]
+        assert steps == [(done, total) for done in range(total + 1)], stage
 
 
 def test_a_second_correction_starts_from_what_the_first_one_left(clip, images, tmp_path, refined):

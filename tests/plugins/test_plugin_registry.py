@@ -319,3 +319,12 @@ def test_malformed_environment_item_is_listed_as_broken(monkeypatch, item):
 def test_absent_plugin_file_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv(VARIABLE, f"{TRACKERS}:mine={tmp_path / 'absent.py'}:Mine")
     assert "absent.py does not exist" in found("mine").reason
+
+
+def test_a_plugin_whose_network_is_absent_needs_weights_if_that_is_asked(monkeypatch, tmp_path):
+    monkeypatch.setenv("TRACKING3D_CACHE", str(tmp_path))
+    quick, built = ({(one.group, one.name): one for one in list_plugins(build)} for build in (False, True))
+    assert quick[TRACKERS, "onnx"].status == "ok"
+    assert built[TRACKERS, "onnx"].status == "needs weights"
+    assert "models get" in built[TRACKERS, "onnx"].reason
+    assert {built[TRACKERS, name].status for name in ("csrt", "flow", "precomputed", "segment")} == {"ok"}

@@ -12,10 +12,12 @@ from filelock import FileLock
 
 import tracking3d
 from tracking3d.rendering.kernels.compilation import _announced
+from tracking3d.runtime.progress import StageProgress, listen_to_progress
 from tracking3d.speed import kernels_ahead
 from tracking3d.speed.kernels_ahead import (
     compile_in_background,
     compile_module,
+    compile_with_progress,
     find_kernels,
     kernel_modules,
 )
@@ -63,13 +65,23 @@ def test_compiling_a_module_compiles_its_kernels():
     assert all(one._compiled is not None for one in find_kernels(importlib.import_module(name)))
 
 
-def test_missing_kernels_are_compiled_by_one_process_and_that_is_said_once(started, caplog):
+def test_compiling_missing_kernels_is_a_stage_with_a_count_beside_a_process_in_the_background(
+    started, caplog
+):
+    heard: list[StageProgress] = []
+    with listen_to_progress(heard.append), caplog.at_level(logging.WARNING):
+        compile_with_progress()
+        assert importlib.import_module("only_kernel").twice._compiled is not None
+        compile_with_progress()  # it is kept now
+    assert heard == [StageProgress("compiling kernels", done, 1) for done in (0, 1)]
+    assert (len(started), caplog.messages) == (1, [])
+
+
+def test_missing_kernels_are_compiled_by_one_process_in_the_background(started, caplog):
     with caplog.at_level(logging.WARNING):
         assert compile_in_background()
         assert importlib.import_module("only_kernel").twice(1.5) == 3  # it is needed sooner
-    assert len(started) == 1
-    [notice] = caplog.messages
-    assert "once, in the background" in notice
+    assert (len(started), caplog.messages) == (1, [])
 
 
 def test_kernels_that_are_kept_are_not_compiled_again(started, caplog):
@@ -116,17 +128,13 @@ def test_all_processes_ask_for_the_same_lock(monkeypatch):
     assert len(set(taken)) == 1
 
 
-def test_quiet_says_nothing(started, caplog):
-    with caplog.at_level(logging.WARNING):
-        assert compile_in_background(quiet=True)
-        assert importlib.import_module("only_kernel").twice(1.5) == 3
-    assert caplog.messages == []
-
-
 def test_without_a_folder_to_keep_them_in_nothing_is_compiled_ahead(started, monkeypatch):
     monkeypatch.setattr(kernels_ahead.Kernel, "folder", None)
-    assert not compile_in_background()
-    assert started == []
+    heard: list[StageProgress] = []
+    with listen_to_progress(heard.append):
+        assert not compile_in_background()
+        compile_with_progress()
+    assert started == heard == []
 
 
 def test_the_slowest_kernel_is_compiled_first():

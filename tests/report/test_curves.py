@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from tracking3d.report.curves import HEIGHT, MOST_POINTS, WIDTH, across, curve, path_of, stretches
+from tracking3d.report.curves import HEIGHT, MOST_POINTS, WIDTH, curve, path_of, stretches
 
 
 def points(path: str) -> list[tuple[float, float]]:
@@ -46,17 +46,9 @@ def test_a_long_run_has_a_short_path():
     assert len(points(path_of(np.linspace(0, 1, 100_000)))) <= 2 * MOST_POINTS
 
 
-def test_stretches_part_where_status_or_reason_change_but_not_where_a_figure_does():
-    status = ["tracked", "tracked", "lost", "lost", "lost", "uncertain"]
-    reason = ["well 1", "otherwise well", "loss 0.31", "loss 0.78", "gone", "gone"]
-    parts = stretches([0, 1, 5, 6, 7, 8], status, reason)
-    assert [(part.frames, part.status) for part in parts] == [
-        ("frames 0 to 1", "tracked"),
-        ("frames 5 to 6", "lost"),
-        ("frame 7", "lost"),
-        ("frame 8", "uncertain"),
-    ]
+def test_stretches_part_where_the_status_changes_and_fill_the_width():
+    parts = stretches(["tracked", "tracked", "lost", "lost", "lost", "uncertain"])
+    assert [part.status for part in parts] == ["tracked", "lost", "uncertain"]
     assert parts[0].x == 0
     assert sum(part.width for part in parts) == pytest.approx(WIDTH)
-    assert all(part.x < across(part.first, 6) < part.x + part.width for part in parts)
-    assert stretches([], [], []) == []
+    assert stretches([]) == []

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile import HOSTILE
+from turning_sphere import turning_sphere_of, written_run
 
 from tracking3d.report import run_report
 from tracking3d.report.comparison import write_comparison
@@ -85,7 +86,15 @@ def test_all_that_can_be_used_is_reached_by_keyboard_and_its_focus_is_seen(brows
             assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") in ("solid", "auto")
             if reached[-1] == "SUMMARY":
                 break
-        assert reached[:7] == ["slider", "play", "before", "after", "model", "follow", "spin"]
+        assert [name for name in reached if name != "A"][:7] == [
+            "slider",
+            "play",
+            "before",
+            "after",
+            "model",
+            "follow",
+            "spin",
+        ]
         assert "SUMMARY" in reached
 
 
@@ -155,6 +164,34 @@ def test_on_a_phone_the_picture_is_seen_while_the_slider_moves_it(browser, repor
     with opened(browser, report, viewport=PHONE) as page:
         boxes = [page.locator(name).bounding_box() for name in ("#picture", "#slider", "#said")]
         assert boxes[2]["y"] + boxes[2]["height"] - boxes[0]["y"] < PHONE["height"]
+
+
+@pytest.fixture(scope="module", params=[(90, 160), (160, 90)], ids=["portrait", "landscape"])
+def sized_report(request, tmp_path_factory) -> Path:
+    """The report of a run whose pictures stand, or lie."""
+    folder = tmp_path_factory.mktemp("sized") / "sphere"
+    written_run(folder, turning_sphere_of(3, *request.param))
+    return write_report(folder, turntable=False)
+
+
+def test_picture_slider_and_play_fit_the_window_with_the_model_beside_them(browser, sized_report):
+    with opened(browser, sized_report, viewport={"width": 1366, "height": 768}) as page:
+        picture, slider, play, model = (
+            page.locator(name).bounding_box() for name in ("#picture", "#slider", "#play", "#model")
+        )
+        assert picture["height"] <= 0.7 * 768 + 1
+        assert picture["y"] + picture["height"] <= slider["y"] <= play["y"]
+        assert play["y"] + play["height"] - picture["y"] < 768
+        assert model["x"] >= picture["x"] + picture["width"]
+        assert abs(model["y"] - picture["y"]) < 20
+
+
+def test_the_first_screen_of_a_phone_is_the_picture(browser, sized_report):
+    with opened(browser, sized_report, viewport=PHONE) as page:
+        for name in ("#picture", "#slider", "#play"):
+            box = page.locator(name).bounding_box()
+            assert 0 < box["y"] < box["y"] + box["height"] < PHONE["height"], name
+        assert page.locator("text=Do this next").bounding_box()["y"] > PHONE["height"]
 
 
 def test_without_javascript_the_first_frame_and_the_model_are_there(browser, report):

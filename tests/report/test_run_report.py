@@ -89,7 +89,10 @@ def test_the_page_is_one_file_that_asks_for_nothing(run_folder):
     for tag, attributes in page.tags:
         for name in ("src", "href", "data", "action"):
             value = attributes.get(name) or ""
-            assert value.startswith("data:") or not value, (tag, value[:40])
+            if tag == "a":  # asks only once it is clicked
+                assert (run_folder / value).exists()
+            else:
+                assert value.startswith("data:") or not value, (tag, value[:40])
     assert not re.search(r"https?://(?!www\.w3\.org)", page.source)
     [policy] = [one["content"] for _, one in page.tags if one.get("http-equiv") == "Content-Security-Policy"]
     assert policy.startswith("default-src 'none'; img-src data:;")
@@ -148,6 +151,131 @@ def test_the_name_of_a_folder_is_escaped_too(run_folder):
     page = report_of(folder)
     assert "<script>alert(1)<" in page.text
     assert [tag for tag, _ in page.tags].count("script") == 2
+
+
+def change_records(folder: Path, *changes: dict) -> RunReader:
+    """Frames of the run as if they had been estimated otherwise: the n-th change for the n-th frame, in turn."""
+    path = folder / layout.FRAMES
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [line | changes[number % len(changes)] for number, line in enumerate(lines)]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return RunReader(folder)
+
+
+PLAIN = {
+    "status": "uncertain",
+    "reason": "the object has hardly any texture (ratio 0.3)",
+    "iou_initial": 0.97,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "masks", "poses"),
+    [
+        (
+            [{"status": "tracked", "iou_initial": 0.9}],
+            "plausible in all 12 frames.",
+            "reliable in all 12 frames.",
+        ),
+        (
+            [PLAIN],
+            "plausible in all 12 frames.",
+            "not reliable (tracked in 0 of 12 frames): the object has hardly any texture.",
+        ),
+        (
+            [{"iou_initial": 0.9}, {"iou_initial": 0.3}],
+            "plausible in 6 of 12 frames.",
+            "reliable in 7 of 12 frames.",
+        ),
+        ([{"iou_initial": None, "area": 0}], "plausible in 0 of 12 frames.", "reliable in 7 of 12 frames."),
+        (
+            [*[{"iou_initial": 1.0, "area": 900}] * 11, {"iou_initial": 1.0, "area": 2500}],
+            "plausible in 11 of 12 frames.",
+            "reliable in 7 of 12 frames.",
+        ),
+    ],
+    ids=["all well", "plain object", "not like the tracker's", "empty", "one is much larger"],
+)
+def test_the_first_line_tells_what_can_be_used_masks_and_poses_apart(run_folder, changes, masks, poses):
+    change_records(run_folder, *changes)
+    assert f"Masks: {masks} Poses: {poses}" in report_of(run_folder).text
+
+
+LENS_GIVEN = {"assumed": False, "focal_deviation": None}
+COMMAND = "tracking3d run clip.mp4 --box 1,2,3,4"
+
+
+@pytest.mark.parametrize(
+    ("changes", "about", "commands"),
+    [
+        ({}, {}, ["export RUN --to blender"]),
+        (PLAIN, {}, ["export RUN --to coco"]),
+        ({}, {"assumed": True}, [f"{COMMAND} --out RUN_again --fov DEGREES", "export RUN --to blender"]),
+        (
+            {"iou_initial": 0.5},
+            {"tracker": "csrt"},
+            [
+                "correct RUN 0:X,Y,WIDTH,HEIGHT",
+                "view RUN",
+                f"{COMMAND} --out RUN_again --tracker segment",
+                "export RUN --to blender",
+            ],
+        ),
+        (
+            {},
+            {"unseen": 0.8},
+            ["run SECOND_VIDEO --box X,Y,WIDTH,HEIGHT --object RUN --extend", "export RUN"],
+        ),
+        ({}, {"state": "interrupted"}, [f"{COMMAND} --resume", "export RUN --to blender"]),
+        (
+            {},
+            {"command": "tracking3d batch clips", "assumed": True},
+            ["run clip.mp4 --box X,Y,WIDTH", "export"],
+        ),
+    ],
+    ids=["well", "plain", "lens", "masks", "unseen", "interrupted", "batch"],
+)
+def test_the_report_gives_the_command_for_what_to_do_next(
+    run_folder, described, monkeypatch, changes, about, commands
+):
+    change_records(run_folder, {"status": "tracked", "iou_initial": 0.95, "area": 900} | changes)
+    (run_folder / layout.STATE).mkdir()
+    (run_folder / layout.STATE / layout.STATE_FILE).write_text("{}")
+    monkeypatch.setattr("tracking3d.report.doubts.unseen_share", lambda _: about.get("unseen", 0.2))
+    described(
+        run_folder,
+        camera=RunReader(run_folder).description["camera"]
+        | LENS_GIVEN
+        | {"assumed": about.get("assumed", False)},
+        config={"tracker": {"name": about.get("tracker", "onnx")}},
+        state=about.get("state", "finished"),
+        command=about.get("command", COMMAND),
+    )
+    shown = report_of(run_folder).text.partition("Do this next")[2].partition("Next to this page")[0]
+    given = [line.strip() for line in shown.splitlines() if "tracking3d " in line]
+    told = [one for line in given for one in line.split("tracking3d ")[1:]]
+    expected = [one.replace("RUN", str(run_folder)).removeprefix("tracking3d ") for one in commands]
+    assert len(told) == len(expected), told
+    assert all(one.startswith(start) for one, start in zip(told, expected, strict=True)), told
+
+
+def test_the_report_links_to_mesh_and_masks(run_folder):
+    links = {attributes.get("href") for tag, attributes in report_of(run_folder).tags if tag == "a"}
+    assert {"mesh.glb", "mesh.obj", "masks", "frames.jsonl", "overlay.mp4"} <= links
+
+
+def test_reasons_that_alternate_are_one_row_with_their_counts(run_folder):
+    change_records(
+        run_folder,
+        {"status": "uncertain", "reason": "too few inliers (3)"},
+        {"status": "uncertain", "reason": "much is new (ratio 0.5)"},
+        {"status": "uncertain", "reason": "too few inliers (8)"},
+    )
+    page = report_of(run_folder)
+    rows = [attributes for tag, attributes in page.tags if tag == "button" and "data-position" in attributes]
+    assert len(rows) == 1
+    assert "frames 0 to 11" in page.text
+    assert "too few inliers (3), 8 frames; much is new (ratio 0.5), 4 frames" in page.text
 
 
 def test_doubts_name_the_lost_the_uncertain_and_what_was_handed_back(run_folder):

@@ -88,7 +88,7 @@ def test_a_frame_that_is_not_at_hand_is_said_to_be_so(follower):
 
 def test_what_a_run_says_is_text_and_never_markup(follower):
     pages = [
-        descriptions.list_streaks([follower, follower]),
+        descriptions.list_doubtful_frames([follower, follower]),
         descriptions.describe_frame(follower, follower.frames[5]),
         descriptions.describe_frame(follower, None),
     ]
@@ -116,11 +116,11 @@ def test_a_description_of_any_kind_is_told_as_text(follower, fault):
     assert page.names <= {"div", "b", "table", "tr", "td", "p"} and "a <run>" in page.text
 
 
-def test_the_list_names_frames_status_and_reason_of_every_streak(follower):
-    text = Tags(descriptions.list_streaks([follower])).text
-    assert "uncertain3 to 4" in text.replace(" 3", "3") and "lost 8: no reason given" in text
+def test_the_list_names_frames_status_and_reason_of_every_range(follower):
+    text = Tags(descriptions.list_doubtful_frames([follower])).text
+    assert "uncertain frames 3 to 4: points" in text and "lost frame 8: no reason given" in text
     follower.frames = {0: follower.frames[0]}
-    assert "No frame is uncertain or lost" in descriptions.list_streaks([follower])
+    assert "No frame is uncertain or lost" in descriptions.list_doubtful_frames([follower])
 
 
 def test_the_timeline_of_a_long_run_stays_small(run):
@@ -134,7 +134,7 @@ def test_the_timeline_of_a_long_run_stays_small(run):
     assert len(points) <= 1400
     lowest = min(float(point.split(",")[1]) for point in points)
     assert lowest == min(float(p.split(",")[1]) for p in points if abs(float(p.split(",")[0]) - 500) < 2)
-    assert len(descriptions.list_streaks([follower])) < 200_000
+    assert len(descriptions.list_doubtful_frames([follower])) < 200_000
 
 
 def test_every_quantity_of_the_run_can_be_plotted(follower):

@@ -13,7 +13,7 @@ from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.viewer.checkpoint_landmarks import landmarks_of_checkpoint
-from tracking3d.viewer.followed_run import FollowedRun, Streak, open_followed_runs
+from tracking3d.viewer.followed_run import FollowedRun, open_followed_runs
 
 
 def followed(folder: Path) -> FollowedRun:
@@ -86,14 +86,6 @@ def test_a_mask_of_another_size_is_none(run):
     assert follower.mask(0, "refined").shape == (64, 96)
     write_mask(run / "masks" / "000000.png", np.ones((5, 5), bool))
     assert follower.mask(0, "refined") is None
-
-
-def test_doubtful_frames_in_a_row_are_one_streak_where_only_figures_differ(run):
-    assert followed(run).streaks() == [
-        Streak(3, 4, Status.UNCERTAIN, "points agree, pixels do not (loss 0.35)"),
-        Streak(5, 5, Status.LOST, "<b onclick='alert(1)'>too few</b> points"),
-        Streak(8, 8, Status.LOST, ""),
-    ]
 
 
 def test_objects_of_one_video_come_in_their_order_with_the_names_they_were_picked_with(tmp_path):

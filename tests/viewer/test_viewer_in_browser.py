@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from browser import open_page
 from recorded_runs import estimate_of, frame_of, model, open_run, write_frames
+from turning_sphere import turning_sphere_of, written_run
 
 pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[view]'")
 
@@ -19,9 +20,9 @@ def shown():
     """Open a viewer of these folders, and a page of it."""
     viewers = []
 
-    def shown(*folders):
+    def shown(*folders, width=1360, height=760):
         viewers.append(open_viewer(folders, Access(), port=0))
-        return open_page(viewers[-1].address, 1360, 760)
+        return open_page(viewers[-1].address, width, height)
 
     yield shown
     for viewer in viewers:
@@ -55,6 +56,20 @@ def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
         page.click("text=Play")
         wait_for_frame(page, 11)
         assert page.locator("canvas").first.bounding_box()["width"] > 200
+
+
+@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)], ids=["desktop", "phone"])
+def test_a_picture_that_stands_fits_the_window_with_slider_and_play_under_it(shown, tmp_path, width, height):
+    written_run(tmp_path / "run", turning_sphere_of(3, 720, 1280))
+    with shown(tmp_path / "run", width=width, height=height) as page:
+        close_notice(page)
+        wait_for_frame(page, 0)
+        picture = page.locator("img[src^='blob:']").bounding_box()
+        play = page.locator("text=Play").bounding_box()
+        assert picture["width"] / picture["height"] == pytest.approx(720 / 1280, abs=0.01)
+        assert picture["height"] <= 0.7 * height
+        assert picture["y"] + picture["height"] < page.locator(".timeline").bounding_box()["y"] < play["y"]
+        assert play["y"] + play["height"] < height
 
 
 def test_nothing_stands_before_the_model_when_looking_through_the_camera(shown, run):

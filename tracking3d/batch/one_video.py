@@ -189,7 +189,7 @@ def telling_stages(tell: Tell) -> ProgressListener:
 
     def listener(progress: StageProgress) -> None:
         nonlocal present
-        if progress.name != present:
+        if progress.name != present and not progress.inside:
             present = progress.name
             tell({"stage": present})
 

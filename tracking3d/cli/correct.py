@@ -66,7 +66,9 @@ def correct(
             typer.echo(sentence, err=True)
     for folder, theirs in by_folder.items():
         earlier = RunReader(folder)
-        plan = plan_run(earlier.config, len(earlier.frames), report=report)
+        first = min(correction.frame for correction in theirs)
+        kept = sum(record.index < first for record in earlier.frames)
+        plan = plan_run(earlier.config, len(earlier.frames), report=report, kept=kept)
         with ExitStack() as ends:
             shown = ends.enter_context(show_progress(quiet, plan))
             reporting = ends.enter_context(report_at_end([folder] if report else []))

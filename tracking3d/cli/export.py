@@ -163,8 +163,8 @@ def export(
 
 
 def _print_export(done: Export, as_json: bool, quiet: bool) -> None:
-    if done.not_finished:
-        typer.echo(done.not_finished, err=True)
+    for sentence in filter(None, (done.not_finished, done.note)):
+        typer.echo(sentence, err=True)
     if as_json:
         import json
 

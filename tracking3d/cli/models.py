@@ -125,7 +125,7 @@ def get(
             checked = "" if network.sha256 else "; its SHA-256 is unknown and was not checked"
             typer.echo(f"{path}: {network.name}, {network.licence}{checked}")
     if failed:
-        raise InputError(" ".join(failed))
+        raise InputError(" ".join(dict.fromkeys(failed)))
 
 
 @app.command()

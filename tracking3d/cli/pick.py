@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Callable
+from contextlib import closing, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,7 +19,9 @@ from tracking3d.cli.options.video import Frames
 from tracking3d.cli.view import show_address
 
 if TYPE_CHECKING:
+    from tracking3d.cli.tracking import RunDisplay, RunRequest
     from tracking3d.config.models import PipelineConfig
+    from tracking3d.picker.server import Picker
     from tracking3d.picker.session import Picked
     from tracking3d.picker.settings import ChosenSettings, SettingsMenu
     from tracking3d.prompts.prompt import PromptSet
@@ -74,19 +74,48 @@ def pick(
     menu = settings_menu(source, frames, tracking, camera, settings, _configure)
     with show_progress(quiet):  # plug-ins are imported to check their options
         config = menu.configure(menu.chosen)
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    load_with_progress("tracking3d.pipeline.record", quiet)
     if view:
         from tracking3d.viewer.opening import check_viser
 
         check_viser("--view")
     from tracking3d.pipeline.record import RecordOptions
+    from tracking3d.prompts.prompt import PromptSet
 
-    folder = out or default_folder(source)
-    picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite, menu)
-    prompts = prompts_of(picked)
-    options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
-    request = RunRequest(source, picked.config or config, folder, prompts, options)
-    track(request, RunDisplay(quiet, view=view, host=host))
+    options = RecordOptions(None, frames, overwrite)
+    request = RunRequest(source, config, out or default_folder(source), PromptSet(), options)
+    with closing(open_picker(request, menu, host, port, browser)) as page:
+        track_picked(page, request, RunDisplay(quiet, view=view, host=host), track)
+
+
+def track_picked(
+    page: Picker, request: RunRequest, display: RunDisplay, start: Callable[[RunRequest, RunDisplay], None]
+) -> None:
+    """Wait for what is picked, or continue with what was picked before; the page shows the run until it is left.
+
+    Args:
+        page: The page.
+        request: The run, without its objects.
+        display: What the terminal shows.
+        start: What tracks.
+    """
+    from tracking3d.cli.progress import load_with_progress
+    from tracking3d.picker.outcome import command_of
+
+    resume = page.picked is not None
+    picked, options = page.wait(), request.options
+    load_with_progress("tracking3d.pipeline.record", display.quiet, kernels=True)
+    command = command_of(picked, request.folder, request.source, options.selection)
+    options = replace(options, command=command, resume=resume)
+    config = picked.config or request.config
+    start(
+        replace(request, config=config, prompts=prompts_of(picked), options=options),
+        replace(display, page=page),
+    )
+    if not display.quiet:
+        typer.echo("The page goes on until it is closed in the browser; Ctrl-C ends it, too.", err=True)
+    with suppress(KeyboardInterrupt):
+        page.wait_until_left()
 
 
 def _configure(tracking: TrackingOptions, camera: CameraOptions, settings: SettingsOptions) -> PipelineConfig:
@@ -165,46 +194,42 @@ def prompts_of(picked: Picked) -> PromptSet:
     return PromptSet(picked.boxes, picked.masks, start_frame=picked.frame, as_lists=several)
 
 
-def picked_in_browser(
-    source: str,
-    frames: str | None,
-    settings: PipelineConfig,
-    folder: Path,
+def open_picker(
+    request: RunRequest,
+    menu: SettingsMenu | None,
     host: str | None = None,
     port: int = 8090,
     browser: bool = True,
-    overwrite: bool = False,
-    menu: SettingsMenu | None = None,
-) -> Picked:
-    """Serve the page until the user starts the run.
+) -> Picker:
+    """Serve the page; if the run in the folder was stopped, that is continued, and nothing is picked.
 
     Args:
-        source: The video.
-        frames: ``START:STOP:STEP``.
-        settings: Settings of the run.
-        folder: The run folder.
+        request: The run, without its objects.
+        menu: The settings that the page offers; None if they are fixed.
         host: See `Access.on`.
         port: The port, or the next free one above it.
         browser: Open the page, if the program was started from a terminal.
-        overwrite: Whether an earlier run in the folder may be replaced.
-        menu: The settings that the page offers; None if ``settings`` are fixed.
 
     Raises:
         InputError: The source cannot be paused, so that no frame can be picked.
         OutputError: There is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
-    from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
+    from tracking3d.picker.outcome import command_of, read_outcome, save_outcome, settings_as_yaml
     from tracking3d.picker.server import Picker
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
     from tracking3d.results.overwrite import check_output_folder
+    from tracking3d.speed.kernels_ahead import compile_in_background
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.selection import within
     from tracking3d.web.access import Access
 
-    if (folder / layout.RUN).exists() and not overwrite:
+    source, folder, options = request.source, request.folder, request.options
+    frames, overwrite = options.selection, options.overwrite
+    picked = None if overwrite else read_outcome(folder)
+    if (folder / layout.RUN).exists() and not overwrite and picked is None:
         raise OutputError(f"{folder} already holds a run; give --overwrite or choose another {layout.OUT}.")
     check_output_folder(folder, overwrite)
     opened, selection = open_source(source, frames), parse_selection(frames)
@@ -212,16 +237,14 @@ def picked_in_browser(
         raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")
     images = frame_images(opened)
     indices = within(selection, images.count or opened.count or 1)
-    session = PickingSession(source, images, indices, settings, menu)
+    compile_in_background()
+    session = PickingSession(source, images, indices, request.config, menu)
 
     def save(picked: Picked) -> tuple[str, str]:
-        chosen = picked.config or settings
+        chosen = picked.config or request.config
         save_outcome(picked, chosen, folder, source)
         return command_of(picked, folder, source, frames), settings_as_yaml(chosen)
 
-    picker = Picker(session, save, Access.on(host), port)
-    try:
-        show_address(picker.address, browser and host is None)
-        return picker.wait()
-    finally:
-        picker.close()
+    picker = Picker(session, save, Access.on(host), port, picked)
+    show_address(picker.address, browser and host is None)
+    return picker

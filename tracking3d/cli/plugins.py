@@ -50,13 +50,13 @@ def plugins(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """List the installed mask trackers and feature encoders, and say what is wrong with a broken one."""
+    """List the installed mask trackers and feature encoders, and say what is wrong with those that cannot run."""
     import json
     from dataclasses import asdict
 
     from tracking3d.plugins import list_plugins
 
-    infos = list_plugins()
+    infos = list_plugins(build=True)
     if as_json:
         typer.echo(json.dumps([asdict(info) for info in infos], indent=2))
         return

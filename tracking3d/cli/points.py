@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -210,8 +211,18 @@ def _print(tracks: PointTracks, as_json: bool) -> None:
 
     if as_json:
         typer.echo(points_to_json(tracks))
-    else:
+    elif not sys.stdout.isatty():
         typer.echo(points_to_csv(tracks), nl=False)
+    else:
+        from rich.table import Table
+
+        from tracking3d.cli.tables import print_table
+
+        heads, *rows = (line.split(",") for line in points_to_csv(tracks).splitlines())
+        table = Table(*heads)
+        for row in rows:
+            table.add_row(*row)
+        print_table(table)
 
 
 def _by_images(tracks: PointTracks) -> str:

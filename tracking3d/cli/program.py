@@ -21,13 +21,25 @@ from types import FrameType
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperGroup, TyperOption
 
 from tracking3d.errors import InputError, Tracking3dError
 
 INTERRUPTED = 130
 UNREAD = 141
 """Exit code of a program whose output is piped into one that has ended, such as ``head``."""
+
+
+def _show_flags_without_type() -> None:
+    """Keep ``--help`` from printing ``<bool>`` behind each flag, as newer versions of typer do."""
+    shown = getattr(TyperOption, "display_type_rich", None)
+    if shown is not None:
+        TyperOption.display_type_rich = (  # type: ignore[method-assign]
+            lambda self, ctx: None if self.is_flag else shown(self, ctx)
+        )
+
+
+_show_flags_without_type()
 
 
 class Program(TyperGroup):

@@ -23,6 +23,7 @@ from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
+    from tracking3d.picker.server import PageProgress
     from tracking3d.results.records import FrameRecord
 
 _EVERY = 10.0
@@ -38,7 +39,9 @@ class ProgressDisplay:
         self._remaining = RemainingTime()
         self._began = time.monotonic()
         self._progress = StageProgress(_STARTING)
-        self._detail = ""
+        self._part = self._detail = ""
+        self._share = 0.0
+        self._frame: int | None = None
 
     def expect(self, plan: Sequence[PlannedStage]) -> None:
         """Estimate the remaining time by these stages from here on."""
@@ -46,22 +49,37 @@ class ProgressDisplay:
 
     def take(self, progress: StageProgress) -> None:
         """Show a stage and how far it is."""
-        if progress.name != self._progress.name:
-            self._detail = ""
-        self._progress = progress
+        self._part = f": {progress.name}" if progress.inside else ""
+        if not progress.inside:
+            self._detail = self._detail if progress.name == self._progress.name else ""
+            self._progress = progress
         self._remaining.take(progress, time.monotonic())
 
     def show_frame(self, frame: FrameRecord | SkippedFrame) -> None:
         """Show what came of a frame: a listener for `tracking3d.pipeline.record`."""
-        self._detail = _describe(frame)
+        self._detail, self._frame = _describe(frame), frame.index
+
+    def progress(self) -> PageProgress:
+        """The same for a page."""
+        from tracking3d.picker.server import PageProgress
+
+        now = time.monotonic()
+        sentence = f"{self._stage}, {self._time(now)}"
+        return PageProgress(True, sentence, share=self._measure(now), frame=self._frame)
+
+    def _measure(self, now: float) -> float | None:
+        """The share that is done; None as long as nothing tells."""
+        left = self._remaining.seconds(now)
+        if left is not None:  # what takes longer than expected holds the bar, and does not move it back
+            self._share = max(self._share, (now - self._began) / (now - self._began + left))
+        return None if left is None else self._share
 
     @property
     def _stage(self) -> str:
-        """The stage with its count."""
+        """The stage with its count, and the part of a step that takes long."""
         now = self._progress
-        if now.total:
-            return f"{now.name} {now.done}/{now.total}"
-        return f"{now.name} {now.done}" if now.done else now.name
+        count = f" {now.done}/{now.total}" if now.total else f" {now.done}" if now.done else ""
+        return f"{now.name}{count}{self._part}"
 
     def _time(self, now: float) -> str:
         """The remaining time, or the time that has gone by as long as the other is unknown."""
@@ -105,13 +123,12 @@ class _Line(ProgressDisplay):
 
     def _refresh(self) -> None:
         now = time.monotonic()
-        left = self._remaining.seconds(now)
-        share = None if left is None else (now - self._began) / (now - self._began + left)
+        share = self._measure(now)
         self._bar.update(
             self._task,
             description=self._stage,
             total=None if share is None else 1.0,
-            completed=share or 0.0,
+            completed=self._share,
             time=self._time(now),
             detail=self._detail,
         )
@@ -165,12 +182,12 @@ def load_with_progress(module: str, quiet: bool, kernels: bool = False) -> None:
     Args:
         module: Its full name.
         quiet: Show nothing meanwhile.
-        kernels: Whether compiled kernels will be needed: those that are missing are compiled in the background.
+        kernels: Whether compiled kernels will be needed: those that are missing are compiled.
     """
     with show_progress(quiet), collection_deferred():
         import_module(module)
         if kernels:
-            import_module("tracking3d.speed.kernels_ahead").compile_in_background(quiet)
+            import_module("tracking3d.speed.kernels_ahead").compile_with_progress()
 
 
 def _describe(frame: FrameRecord | SkippedFrame) -> str:

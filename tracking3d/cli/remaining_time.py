@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 from tracking3d.runtime.progress import StageProgress
 
@@ -27,25 +28,30 @@ class PlannedStage:
     Attributes:
         name: As `StageProgress.name` has it.
         seconds: What it costs, on the machine that the plan was made on.
+        steps: How many steps are planned; if the stage turns out to have more or fewer, it costs in proportion. None
+            if the cost does not depend on them.
     """
 
     name: str
     seconds: float
+    steps: int | None = None
 
 
 class RemainingTime:
     """Estimates the remaining time from the plan and from what is reported.
 
+    A stage inside another takes its time from that one. One that is interrupted goes on where it was.
+
     Args:
-        plan: The stages in their order; those that several objects go through one after the other appear once, with
-            the cost of all. Stages that are reported but not planned are judged by their own pace.
+        plan: The stages in their order, each as often as it comes. Those that are reported but not planned are judged
+            by their own pace; those that are planned and left out cost nothing.
     """
 
     def __init__(self, plan: Sequence[PlannedStage] = ()) -> None:
-        self._plan = plan
+        self._plan = list(plan)
         self._spent: dict[int, float] = {}  # by place in the plan
         self._place = -1  # of the latest stage that is in the plan
-        self._planned: PlannedStage | None = None  # the present stage, if it is
+        self._planned = False  # whether the present stage is
         self._now: StageProgress | None = None
         self._began = 0.0
         self._steps = deque[tuple[float, int]](maxlen=_PACE)
@@ -57,12 +63,14 @@ class RemainingTime:
             progress: The report.
             now: Its time in seconds, of any clock that only goes on.
         """
+        if progress.inside and self._now is not None:
+            return
         if self._now is None or progress.name != self._now.name:
-            if self._planned is not None:
-                self._spent[self._place] = self._spent.get(self._place, 0.0) + now - self._began
+            if self._planned:
+                self._spent[self._place] = self._elapsed(now)
             self._began = now
             self._steps.clear()
-            self._planned = self._find(progress.name)
+            self._planned = self._find(progress)
         self._now = progress
         self._steps.append((now, progress.done))
 
@@ -74,36 +82,52 @@ class RemainingTime:
         pending = sum(stage.seconds for stage in self._plan[self._place + 1 :])
         return max(present + self._factor(now) * pending, LEAST)
 
-    def _find(self, name: str) -> PlannedStage | None:
-        """The next stage of that name in the plan, or an earlier one that a further object goes through."""
-        places = [place for place, stage in enumerate(self._plan) if stage.name == name]
-        if not places:
-            return None
-        self._place = next((place for place in places if place > self._place), places[0])
-        return self._plan[self._place]
+    def _find(self, progress: StageProgress) -> bool:
+        """Go to the stage in the plan, this one or a later one; False if there is none."""
+        places = range(max(self._place, 0), len(self._plan))
+        place = next((place for place in places if self._plan[place].name == progress.name), None)
+        if place is None:
+            return False
+        self._place, stage = place, self._plan[place]
+        if stage.steps and progress.total is not None:
+            revised = stage.seconds * progress.total / stage.steps
+            self._plan[place] = replace(stage, seconds=revised, steps=progress.total)
+        return True
+
+    def _elapsed(self, now: float) -> float:
+        """Seconds of the present stage, those before it was interrupted too."""
+        return now - self._began + (self._spent.get(self._place, 0.0) if self._planned else 0.0)
 
     def _rest_of_stage(self, now: float) -> float | None:
         """Seconds until the present stage ends; None if nothing tells."""
         if self._now is None:
             return None
-        elapsed, total = now - self._began, self._now.total
-        (first, done_first), (last, done) = self._steps[0], self._steps[-1]
-        if total and done > done_first:
-            pace, waiting = (last - first) / (done - done_first), now - last
-            this_step = max(pace - waiting, _OVERDUE * waiting) if done < total else 0.0
-            return pace * max(total - done - 1, 0) + this_step
-        if self._planned is None:
-            return None
-        return max(self._factor(now) * self._planned.seconds - elapsed, _OVERDUE * elapsed)
+        elapsed, total, done = self._elapsed(now), self._now.total, self._now.done
+        planned = self._factor() * self._plan[self._place].seconds if self._planned else 0.0
+        if not total or done == self._steps[0][1]:
+            return max(planned - elapsed, _OVERDUE * elapsed) if self._planned else None
+        pace, waiting = self._pace(), now - self._steps[-1][0]
+        this_step = max(pace - waiting, _OVERDUE * waiting) if done < total else 0.0
+        rest = pace * max(total - done - 1, 0) + this_step
+        # The less of a stage is done, the less its pace says: its longest step may be still to come.
+        return rest + (1 - done / total) * max(planned - elapsed - rest, 0.0)
 
-    def _factor(self, now: float) -> float:
-        """How many times longer than planned the stages take here."""
+    def _pace(self) -> float:
+        """Seconds of a step, by the last ones; one that took longer than all others together does not count."""
+        (first, done_first), (last, done) = self._steps[0], self._steps[-1]
+        span, longest = last - first, max(after[0] - before[0] for before, after in pairwise(self._steps))
+        once = done - done_first > 2 and longest > span / 2
+        return (span - longest) / (done - done_first - 1) if once else span / (done - done_first)
+
+    def _factor(self, now: float | None = None) -> float:
+        """How many times longer than planned the stages take here; ``now``, the present one counts too."""
         planned = measured = _TRUSTED
         for place, spent in self._spent.items():
-            planned, measured = planned + self._plan[place].seconds, measured + spent
-        if self._planned is not None and self._now is not None and self._now.total:
-            share = self._now.done / self._now.total
-            planned, measured = planned + share * self._planned.seconds, measured + now - self._began
+            if place != self._place or not self._planned:
+                planned, measured = planned + self._plan[place].seconds, measured + spent
+        if now is not None and self._planned and self._now is not None and self._now.total:
+            planned += self._now.done / self._now.total * self._plan[self._place].seconds
+            measured += self._elapsed(now)
         return measured / planned
 
 

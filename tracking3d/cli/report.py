@@ -40,7 +40,7 @@ def report(
 
     folders = runs_in(run)
     with show_progress(quiet) as display:
-        display.expect(plan_report(sum(len(RunReader(folder).frames) for folder in folders)))
+        display.expect([stage for folder in folders for stage in plan_report(len(RunReader(folder).frames))])
         written = write_reports(folders)
     if not quiet:
         for path in written:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +26,7 @@ from tracking3d.cli.options.performance import PerformanceOptions
 from tracking3d.cli.options.prompt import PromptOptions
 from tracking3d.cli.options.tracking import TrackingOptions
 from tracking3d.cli.options.video import Source, VideoOptions
-from tracking3d.cli.pick import settings_menu
+from tracking3d.cli.pick import open_picker, settings_menu, track_picked
 from tracking3d.cli.split import track_in_parts
 from tracking3d.cli.tracking import RunDisplay, RunRequest, a_person_is_there, default_folder, track
 from tracking3d.errors import InputError
@@ -33,7 +34,6 @@ from tracking3d.runtime.garbage_collection import collection_deferred
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.picker.settings import SettingsMenu
     from tracking3d.prompts.corrections import Correction
     from tracking3d.prompts.prompt import PromptSet
 
@@ -78,26 +78,27 @@ def run(
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), performance.split is not None)
     check_extended(config, len(prompts), performance.split is not None)
-    if not prompts and needs_prompt(config):
-        if not a_person_is_there() or quiet or output.resume or source.isdigit():
-            raise InputError(
-                "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
-                "--masks DIR, or draw it with `tracking3d pick`."
-            )
-        load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
-        configure = partial(_configure_in_browser, prompt, output, performance)
-        menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
-        prompts, config = _ask_in_browser(source, folder, video.frames, output.overwrite, menu)
-    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
+    asks = not prompts and needs_prompt(config)
+    if asks and (not a_person_is_there() or quiet or output.resume or source.isdigit()):
+        raise InputError(
+            "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or --masks DIR, "
+            "or draw it with `tracking3d pick`."
+        )
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=not asks)
     from tracking3d.pipeline.record import RecordOptions
 
     options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
     request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
-    if performance.split is not None:
-        track_in_parts(request, performance.split, performance.workers, display)
-    else:
-        track(request, display)
+    split = performance.split
+    start = track if split is None else partial(track_in_parts, length=split, workers=performance.workers)
+    if not asks:
+        return start(request, display)
+    configure = partial(_configure_in_browser, prompt, output, performance)
+    menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
+    typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
+    with closing(open_picker(request, menu)) as page:
+        track_picked(page, request, display, start)
 
 
 def _configure(
@@ -176,16 +177,4 @@ def _command() -> str:
     """The command line, for the record; without the passwords in it."""
     from tracking3d.video.addresses import without_password
 
-    return shlex.join(map(without_password, sys.argv))
-
-
-def _ask_in_browser(
-    source: str, folder: Path, frames: str | None, overwrite: bool, menu: SettingsMenu
-) -> tuple[PromptSet, PipelineConfig]:
-    """The objects that a person marks in the browser, and the settings that they choose there."""
-    from tracking3d.cli.pick import picked_in_browser, prompts_of
-
-    typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
-    config = menu.configure(menu.chosen)
-    picked = picked_in_browser(source, frames, config, folder, overwrite=overwrite, menu=menu)
-    return prompts_of(picked), picked.config or config
+    return shlex.join(["tracking3d", *map(without_password, sys.argv[1:])])

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from tracking3d.submaps.job import SplitResult
 
 
-def track_in_parts(request: RunRequest, length: str, workers: int | None, display: RunDisplay) -> None:
+def track_in_parts(request: RunRequest, display: RunDisplay, length: str, workers: int | None) -> None:
     """Track a video in parts, show the progress, and print a summary.
 
     Args:
         request: What is tracked.
+        display: What is shown.
         length: Length of a part, as ``--split`` has it.
         workers: Processes at the same time; one per processor if None.
-        display: What is shown.
 
     Raises:
         InputError: Options do not go together.

@@ -57,7 +57,7 @@ def print_summary(folder: Path) -> None:
         table.add_row("better masks", escape(advice))
     for note in run["notes"]:
         table.add_row("note", f"[yellow]{escape(note)}[/]")
-    for what, names in _OUTPUTS.items():
+    for what, names in layout.OUTPUTS.items():
         if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
             table.add_row(what, "\n".join(files))
     print_table(table)
@@ -82,11 +82,3 @@ def advise_networks(tracker: str) -> str:
 
 
 _WITHOUT_NETWORKS = {"csrt", "flow", "segment"}
-_OUTPUTS = {
-    "poses": (layout.FRAMES,),
-    "masks": (layout.MASKS,),
-    "mesh": (layout.OBJ, layout.GLB),
-    "video": (layout.OVERLAY,),
-    "contact sheet": (layout.CONTACT_SHEET,),
-    "report": (layout.REPORT,),
-}

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,7 @@ import typer
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
+    from tracking3d.picker.server import PageProgress, Picker
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.prompts.corrections import Correction
     from tracking3d.prompts.prompt import PromptSet
@@ -54,12 +57,14 @@ class RunDisplay:
         report: Write a report at the end.
         view: Show the run in the browser.
         host: Address of this machine that the page is served on; this machine only if None.
+        page: The page on which the object was picked, which shows the run then; None without it.
     """
 
     quiet: bool = False
     report: bool = True
     view: bool = False
     host: str | None = None
+    page: Picker | None = None
 
 
 def track(request: RunRequest, display: RunDisplay) -> None:
@@ -83,11 +88,13 @@ def track(request: RunRequest, display: RunDisplay) -> None:
     folders = object_folders(folder, objects) if objects > 1 else [folder]
     finished = {one: times_written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
-        ends.enter_context(resumable(folders))
+        ends.enter_context(resumable(folders, options))
         plan = plan_run(request.config.model_dump(), source.count, objects, display.report)
         shown = ends.enter_context(show_progress(display.quiet, plan))
         reporting = ends.enter_context(report_at_end(folders if display.report else []))
         listener = reporting(shown.show_frame)
+        if display.page is not None:
+            ends.enter_context(_shown_on_page(display, folder, folders, shown.progress))
         if display.view:
             source, listener = ends.enter_context(
                 watch(source, folder, listener, display.host, display.quiet)
@@ -98,6 +105,29 @@ def track(request: RunRequest, display: RunDisplay) -> None:
         record_tracking(tracking, folder, options, listener)
     if not display.quiet:
         _print_summaries(folders, finished)
+
+
+@contextmanager
+def _shown_on_page(
+    display: RunDisplay, folder: Path, folders: Sequence[Path], progress: Callable[[], PageProgress]
+) -> Iterator[None]:
+    """Within, the page shows how far the run is, and afterwards that it is finished."""
+    from tracking3d.picker.server import PageProgress, ShownRun
+
+    page = display.page
+    assert page is not None
+
+    @cache
+    def view() -> str:
+        from tracking3d.viewer.opening import open_viewer
+
+        viewer = open_viewer([folder], page.access)
+        page.ends.callback(viewer.close)
+        return viewer.address
+
+    page.run = run = ShownRun(folders, progress, view if find_spec("viser") else None)
+    yield
+    page.run = replace(run, progress=lambda: PageProgress(sentence="The run is finished."))
 
 
 def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, tuple[int, ...]]) -> None:
@@ -123,15 +153,18 @@ def a_person_is_there() -> bool:
 
 
 @contextmanager
-def resumable(folders: list[Path]) -> Iterator[None]:
-    """If a run is stopped, say how to continue it, if it can be continued."""
+def resumable(folders: list[Path], options: RecordOptions) -> Iterator[None]:
+    """If a run is stopped, say how to continue it, if it can be continued: by its command."""
+    from tracking3d.errors import InputError
+    from tracking3d.results.description import for_new_folder
     from tracking3d.results.layout import CORRECTING, has_state
 
     try:
         yield
     except BaseException as error:
-        if any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
-            error.add_note("To continue from there, repeat the command with --resume.")
+        refused = options.resume and isinstance(error, InputError)  # it would be refused again
+        if not refused and any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
+            error.add_note(f"To continue from there: {for_new_folder(options.command or '')} --resume")
         raise
 
 

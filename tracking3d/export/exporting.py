@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ from tracking3d.runtime.progress import report_progress
 
 if TYPE_CHECKING:
     from tracking3d.export.exported_run import ExportedRun
+    from tracking3d.results.run_reader import RunReader
 
 FOLDER = EXPORT
 """Default folder of exports, in the run folder."""
@@ -65,6 +66,7 @@ class Export:
         without: Frames between the first and the last that have none: skipped, and of poses, lost.
         not_finished: A sentence about a run that has not come to its end; empty for one that has.
         of_model: Whether it is the model and nothing of single frames.
+        note: A sentence about images that are left out, or a video that was given in vain; empty if there is none.
     """
 
     path: Path
@@ -73,6 +75,7 @@ class Export:
     without: tuple[int, ...]
     not_finished: str = ""
     of_model: bool = False
+    note: str = ""
 
     @property
     def in_words(self) -> str:
@@ -128,6 +131,7 @@ def export_run(
     from tracking3d.results.run_reader import RunReader
 
     reader = RunReader(Path(run), refined=options.answers == "final")
+    options, note = _without_video(exporter, options, reader)
     exported = ExportedRun(reader, options)
     path = reader.folder / FOLDER / exporter.default_name(exported) if out is None else Path(out).resolve()
     _check_place(path, exporter, overwrite)
@@ -143,7 +147,28 @@ def export_run(
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
     unit = exported.unit if "object_size" in exporter.options else None
     given = path if out is None else Path(out)
-    return Export(given, unit, len(answered), without, reader.not_finished, exporter.kind == "model")
+    return Export(given, unit, len(answered), without, reader.not_finished, exporter.kind == "model", note)
+
+
+def _without_video(exporter: Exporter, options: ExportOptions, run: RunReader) -> tuple[ExportOptions, str]:
+    """The options, without images if the format can do without them and the video is gone, and what to say of it."""
+    from tracking3d.results.run_source import open_run_source
+
+    named = "The source that was given"
+    if "images" not in exporter.options:
+        lost = options.source is not None and not Path(options.source).exists()
+        return (
+            options,
+            f"{named}, {options.source}, does not exist; the export does without it." if lost else "",
+        )
+    if not options.images:
+        return options, f"{named} is not used without images." if options.source is not None else ""
+    try:
+        open_run_source(run, options.source)
+    except InputError as error:
+        if options.source is None:
+            return replace(options, images=False), f"The images are left out. {error}"
+    return options, ""
 
 
 def _check(options: ExportOptions) -> None:

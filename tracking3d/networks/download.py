@@ -73,14 +73,16 @@ def fetch(
             f"{network.name} cannot be downloaded: {network.how} ({network.authors}), {_by_hand(network)}."
         )
     with _arriving(network, keep=True) as part:
-        reasons = []
+        reasons: dict[str, str] = {}
         for address in addresses:
             if not (reason := _fetch_from(address, network, part, listener)):
                 break
-            reasons.append(reason if len(addresses) == 1 else f"{address}: {reason}")
+            reasons[address] = reason
         else:
+            alike = len(set(reasons.values())) == 1
+            why = reason if alike else "; ".join(f"{one}: {reason}" for one, reason in reasons.items())
             raise InputError(
-                f"{network.name} could not be downloaded ({'; '.join(reasons)}): download {addresses[-1]} elsewhere, "
+                f"{network.name} could not be downloaded ({why}): download {addresses[-1]} elsewhere, "
                 f"{_by_hand(network)}."
             )
     return network_path(network)

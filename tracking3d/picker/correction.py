@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.picker.drawing import parse_object
-from tracking3d.picker.server import Picker
+from tracking3d.picker.server import PageProgress, Picker, ShownRun
 from tracking3d.picker.session import PickingSession
 from tracking3d.web.access import Access
 
@@ -30,23 +30,6 @@ class DrawnCorrection:
     frame: int
     box: Box | None = None
     mask: NDArray[np.bool_] | None = None
-
-
-@dataclass(frozen=True)
-class CorrectionProgress:
-    """How far a correction is.
-
-    Attributes:
-        running: Whether it goes on.
-        sentence: How far, or how it ended; empty if there was none.
-        failed: Whether it ended without a result.
-        share: Share of the frames that are done, in [0, 1]; None if unknown.
-    """
-
-    running: bool = False
-    sentence: str = ""
-    failed: bool = False
-    share: float | None = None
 
 
 class CorrectionPage(Picker):
@@ -68,18 +51,16 @@ class CorrectionPage(Picker):
         name: str,
         present: Callable[[int], NDArray[np.bool_] | None],
         begin: Callable[[DrawnCorrection], None],
-        progress: Callable[[], CorrectionProgress],
+        progress: Callable[[], PageProgress],
         access: Access,
         port: int,
     ) -> None:
-        self._name, self._present, self._begin, self._progress = name, present, begin, progress
+        self._name, self._present, self._begin = name, present, begin
         super().__init__(session, lambda picked: ("", ""), access, port)
+        self.run = ShownRun((), progress)
 
     def told(self, path: str) -> Any | None:
         """See `Picker.told`."""
-        if path == "/progress.json":
-            now = self._progress()
-            return {name: getattr(now, name) for name in ("running", "sentence", "failed", "share")}
         told = super().told(path)
         return told and {**told, "correcting": self._name}
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
 
+from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import Tracking3dError
+from tracking3d.picker.drawing import DrawnObject
 from tracking3d.picker.session import Picked
 from tracking3d.results import layout
-from tracking3d.results.files import write_atomic, write_mask, writing
+from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
+from tracking3d.results.run_reader import is_finished
 from tracking3d.video import parse_selection
 
 FOLDER = layout.PICKED
@@ -39,9 +44,27 @@ def save_outcome(picked: Picked, config: PipelineConfig, folder: Path, source: s
         "source": source,
         "frame": picked.frame,
         "objects": [one.model_dump(mode="json") for one in picked.objects],
+        "boxes": picked.boxes,
     }
     write_atomic(folder / DESCRIPTION, (json.dumps(description, indent=1) + "\n").encode())
     write_atomic(folder / SETTINGS, settings_as_yaml(config).encode())
+
+
+def read_outcome(folder: Path) -> Picked | None:
+    """What was picked for the run in a folder that was stopped and can be continued; None if there is none."""
+    runs = [path.parent for path in (*folder.glob(layout.RUN), *folder.glob(f"object_*/{layout.RUN}"))]
+    if not any(layout.has_state(run) for run in runs) or all(is_finished(run) for run in runs):
+        return None
+    try:
+        told = json.loads((folder / DESCRIPTION).read_bytes())
+        objects = tuple(DrawnObject.model_validate(one) for one in told["objects"])
+        config = load_config(folder / SETTINGS)
+        picked = Picked(int(told["frame"]), objects, [tuple(box) for box in told["boxes"]], config=config)
+    except (OSError, ValueError, KeyError, TypeError, Tracking3dError):
+        return None
+    files = [] if picked.boxes else [folder / FOLDER / f"object_{n}.png" for n in range(len(objects))]
+    masks = [mask for file in files if (mask := read_mask(file)) is not None]
+    return replace(picked, masks=masks) if picked.boxes or len(masks) == len(objects) else None
 
 
 def mask_files(picked: Picked, folder: Path) -> list[Path]:

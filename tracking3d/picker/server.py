@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import _thread
 import io
 import json
 import re
+import signal
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from itertools import chain
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +27,9 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
-from tracking3d.picker.settings import TRACKER_FOR, parse_settings, setting_choices, settings_in_words
+from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words, tracker_lines
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask
 from tracking3d.web.access import SAFE_HEADERS, Access
 from tracking3d.web.connections import Connections, TimedReader
 
@@ -30,8 +39,11 @@ MOST_CONNECTIONS = 32
 """Requests that are worked on at a time; a browser needs a few."""
 PATIENCE = 15.0
 """Seconds that a request may take to arrive, and its response to be taken."""
+LEFT = 90.0
+"""Seconds without a request after which the page is closed; a browser may wake one that is hidden once a minute."""
 _POLL = 0.05  # seconds until it is seen that the server is to stop
 _PORTS = 100  # that are tried, from the wanted one on
+_FILE = re.compile(r"/run/(\d{1,2})/([a-z_]{1,20}\.[a-z0-9]{1,5})")
 _FRAME = re.compile(r"/frame/(\d{1,9})\.jpg")
 _PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -43,25 +55,67 @@ _POLICY = (
 )
 
 
+@dataclass(frozen=True)
+class PageProgress:
+    """How far a run or a correction is.
+
+    Attributes:
+        running: Whether it goes on.
+        sentence: How far, or how it ended; empty if there was none.
+        failed: Whether it ended without a result.
+        share: What is done of it, in [0, 1]; None if unknown.
+        frame: Index of the latest frame that was estimated; None if there is none.
+    """
+
+    running: bool = False
+    sentence: str = ""
+    failed: bool = False
+    share: float | None = None
+    frame: int | None = None
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """The run that a page shows once it has started.
+
+    Attributes:
+        folders: The run folders of its objects.
+        progress: How far it is.
+        view: Opens the viewer, and gives its address; None without it.
+    """
+
+    folders: Sequence[Path]
+    progress: Callable[[], PageProgress]
+    view: Callable[[], str] | None = None
+
+
 class Picker:
-    """Serves the page until something was picked.
+    """Serves the page until it is closed: first to pick the object, then to look at the run.
 
     Args:
         session: What the page asks for.
         save: Writes what was picked to the run folder, and gives the command of the run and the settings as YAML.
         access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
+        picked: What was picked before, if a run is continued.
 
     Raises:
         InputError: If it cannot listen there.
     """
 
     def __init__(
-        self, session: PickingSession, save: Callable[[Picked], tuple[str, str]], access: Access, port: int
+        self,
+        session: PickingSession,
+        save: Callable[[Picked], tuple[str, str]],
+        access: Access,
+        port: int,
+        picked: Picked | None = None,
     ) -> None:
         self.session, self.save, self.access = session, save, access
-        self.picked: Picked | None = None
+        self.picked, self.run = picked, ShownRun((), lambda: PageProgress(True, "Starting …"))
+        self.ends = ExitStack()  # of what is opened from the page
         self._over = threading.Event()
+        self._asked = time.monotonic()
         self._server = _listening(self, access.host, port)
         self.port: int = self._server.server_address[1]
         self.address = access.address(self.port)
@@ -72,13 +126,36 @@ class Picker:
 
     def wait(self) -> Picked:
         """What the person picked, once the run is to start."""
-        self._over.wait()
+        if self.picked is None:
+            self._over.wait()
         assert self.picked is not None
         return self.picked
 
+    def wait_until_left(self) -> None:
+        """Wait until nobody has the page open any more, which asks for the progress while it is."""
+        while time.monotonic() - self._asked < LEFT:
+            time.sleep(_POLL)
+
     def told(self, path: str) -> Any | None:
         """The JSON response to a GET request of the page; None if there is none."""
-        return _describe(self.session) if path == "/session.json" else None
+        if path == "/session.json":
+            return {**_describe(self.session), "started": self.picked is not None}
+        if path != "/progress.json":
+            return None
+        self._asked, now = time.monotonic(), self.run.progress()
+        reports = [n for n, one in enumerate(self.run.folders) if (one / layout.REPORT).is_file()]
+        return {
+            **asdict(now),
+            "veils": [] if now.frame is None else self._veils(now.frame),
+            "reports": [f"run/{number}/{layout.REPORT}" for number in reports if not now.running],
+            "viewer": self.run.view is not None,
+        }
+
+    def file(self, number: int, name: str) -> Path | None:
+        """A file of the run of an object, which its report links to; None if there is none."""
+        names = {*chain(*layout.OUTPUTS.values()), layout.MTL, layout.TEXTURE} - {layout.MASKS}
+        path = self.run.folders[number] / name if number < len(self.run.folders) and name in names else None
+        return path if path is not None and path.is_file() else None
 
     def order(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
         """Do what the page orders.
@@ -93,6 +170,10 @@ class Picker:
         Raises:
             Tracking3dError: If it cannot be done.
         """
+        if path == "/stop" and self.picked is not None:
+            return {}, _interrupt
+        if path == "/view" and self.run.view is not None:
+            return {"address": self.run.view()}, _nothing
         if path == "/mask":
             drawn = parse_object(body)
             return self.show(self.session.mask(drawn), drawn.colour)
@@ -110,6 +191,15 @@ class Picker:
         """The response that shows a mask ``(H, W)``; see `order`."""
         return {"veil": self.session.veil(mask, colour), "area": int(mask.sum())}, _nothing
 
+    def _veils(self, frame: int) -> list[str]:
+        """The masks of all objects in a frame, each in the colour that it was picked with."""
+        objects = self.picked.objects if self.picked is not None else ()
+        masks = [
+            (one, read_mask(layout.mask_path(folder, frame)))
+            for one, folder in zip(objects, self.run.folders, strict=False)
+        ]
+        return [self.session.veil(mask, one.colour) for one, mask in masks if mask is not None]
+
     def start(self, picked: Picked) -> None:
         """The run is to start with that."""
         self.picked = picked
@@ -117,6 +207,7 @@ class Picker:
 
     def close(self) -> None:
         """Stop serving."""
+        self.ends.close()
         self._server.shutdown()
         self._server.server_close()
 
@@ -177,6 +268,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, (files("tracking3d.picker") / "page" / name).read_bytes(), kind)
         elif (told := picker.told(path)) is not None:
             self._send_json(told)
+        elif (found := _FILE.fullmatch(path)) and (file := picker.file(int(found[1]), found[2])):
+            kind = "text/html; charset=utf-8" if file.suffix == ".html" else "application/octet-stream"
+            # The report has a policy of its own, and runs its own script only.
+            self._send(HTTPStatus.OK, file.read_bytes(), kind, **SAFE_HEADERS)
         elif found := _FRAME.fullmatch(path):
             picture = picker.session.picture(int(found[1]))
             if picture is None:
@@ -275,6 +370,14 @@ def _nothing() -> None:
     pass
 
 
+def _interrupt() -> None:
+    """Do what Ctrl-C does."""
+    if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
+
 def _describe(session: PickingSession) -> dict[str, Any]:
     frames = session.frames
     return {
@@ -286,7 +389,7 @@ def _describe(session: PickingSession) -> dict[str, Any]:
         "height": session.height,
         "tracker": session.config.tracker.name,
         "choices": setting_choices(session.config) if session.menu else None,
-        "tracker_for": TRACKER_FOR,
+        "tracker_for": tracker_lines(),
         **_describe_settings(session),
     }
 

@@ -81,6 +81,12 @@ def setting_choices(config: PipelineConfig) -> dict[str, list[str]]:
     }
 
 
+def tracker_lines() -> dict[str, str]:
+    """What each mask tracker is for; of further ones, where they come from."""
+    further = {one.name: f"from {one.package}" for one in list_plugins() if one.group == TRACKERS}
+    return further | {"onnx": "networks that you name"} | TRACKER_FOR
+
+
 def settings_in_words(config: PipelineConfig) -> dict[str, str]:
     """What a configuration comes to, for the settings that were not chosen."""
     shape = config.object

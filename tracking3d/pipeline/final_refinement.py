@@ -75,6 +75,12 @@ class FinalRefinement:
             look = GlobalAdjustment(self._session.result(), camera, causal, wanted.adjustment_views)
         self._last = RefinementSteps(estimates, look, fixed=tracked.corrections, earlier=earlier)
 
+    @property
+    def frames_again(self) -> frozenset[int]:
+        """Indices of the frames whose estimates are made again; those of the others stand."""
+        kept = self._earlier.kept if self._earlier else ()
+        return frozenset(self._estimates.causal).difference(kept)
+
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Estimate the object in a frame again, unless its estimate stands; None if it has no causal estimate."""
         estimates, state, earlier = self._estimates, self._state, self._earlier

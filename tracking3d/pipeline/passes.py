@@ -145,7 +145,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         for recording in active:
             with active.guard(recording):
                 recording.begin_refinement(source)
-        with closing(_read_again("refining frames", source)) as again:
+        with closing(_read_again("refining frames", source, active)) as again:
             for frame in again if any(one.needs_second_pass for one in active) else ():
                 for recording in active:
                     with active.guard(recording):
@@ -163,7 +163,7 @@ def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
         with active.guard(recording):
             refinement.adjust_all()
     decides_masks = any(each.decides_masks for _, each in active.refining())
-    with closing(_read_again("collecting masks", source)) as again:
+    with closing(_read_again("collecting masks", source, active)) as again:
         for frame in again if decides_masks else ():
             for recording, refinement in active.refining():
                 with active.guard(recording):
@@ -171,7 +171,7 @@ def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
     for recording, refinement in active.refining():
         with active.guard(recording):
             refinement.settle_masks()
-    with closing(_read_again("refining masks" if decides_masks else "drawing", source)) as again:
+    with closing(_read_again("refining masks" if decides_masks else "drawing", source, active)) as again:
         for frame in again if any(active.refining()) else ():
             for recording, refinement in active.refining():
                 with active.guard(recording):
@@ -179,9 +179,13 @@ def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
     _finish_writing(active)
 
 
-def _read_again(stage: str, source: FrameSource) -> Generator[Frame]:
-    """The frames once more, each a step of a stage."""
-    return report_each(stage, read_again(source), source.count)
+def _read_again(stage: str, source: FrameSource, active: ActiveRecordings) -> Generator[Frame]:
+    """The frames once more; those of which an estimate is made again are the steps of a stage."""
+    made = [refinement.frames_again for _, refinement in active.refining()]
+    if not made:
+        return report_each(stage, read_again(source), source.count)
+    frames = frozenset[int]().union(*made)
+    return report_each(stage, read_again(source), len(frames), lambda frame: frame.index in frames)
 
 
 def _finish_writing(active: ActiveRecordings) -> None:

@@ -25,6 +25,10 @@ _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", 
 """Attributes of an instance besides its methods; an encoder may know its channels only once it is built."""
 
 
+_MASKS_GIVEN = "precomputed"
+"""The tracker that needs masks, which come by an option of their own, and no weights."""
+
+
 @dataclass(frozen=True)
 class PluginInfo:
     """Description of one registered plug-in.
@@ -35,7 +39,8 @@ class PluginInfo:
         package: The distribution that registers it, or ``TRACKING3D_PLUGINS``.
         version: The distribution's version, or a short hash of the file of a module under development; empty if
             unknown.
-        status: ``duplicate`` means that another plug-in has the name already.
+        status: ``duplicate`` means that another plug-in has the name already, ``needs weights`` that its network has to
+            be downloaded or named first.
         reason: Why the status is not ``ok``.
         options: JSON schema of its options, if the status is ``ok``.
     """
@@ -44,18 +49,22 @@ class PluginInfo:
     group: str
     package: str
     version: str
-    status: Literal["ok", "broken", "duplicate"]
+    status: Literal["ok", "broken", "duplicate", "needs weights"]
     reason: str = ""
     options: dict[str, Any] | None = None
 
 
-def list_plugins() -> list[PluginInfo]:
-    """Every registered plug-in with its status; imports all of them, and reports those that fail."""
+def list_plugins(build: bool = False) -> list[PluginInfo]:
+    """Every registered plug-in with its status; imports all of them, and reports those that fail.
+
+    Args:
+        build: Also build each with the options that it has by default, to see whether it can run.
+    """
     infos = []
     first: dict[tuple[str, str], Registered] = {}
     for plugin in find_plugins():
         winner = first.setdefault((plugin.group, plugin.name), plugin)
-        status: Literal["ok", "broken", "duplicate"] = "ok"
+        status: Literal["ok", "broken", "duplicate", "needs weights"] = "ok"
         reason, options = "", None
         if winner is not plugin:
             status, reason = "duplicate", f"the name is taken by the {winner.label}"
@@ -66,6 +75,11 @@ def list_plugins() -> list[PluginInfo]:
                 raise
             except BaseException as error:
                 status, reason = "broken", describe_exception(error)
+            if build and status == "ok" and plugin.name != _MASKS_GIVEN:
+                try:
+                    build_plugin(plugin.group, PluginChoice(name=plugin.name))
+                except Tracking3dError as error:
+                    status, reason = "needs weights", error.at_the_command_line
         infos.append(
             PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
         )

@@ -112,9 +112,7 @@ def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
         status = {record.index: record.status.value for record in run.frames}
         statuses = [status.get(index, "no estimate") for index in frames]
         counts = ", ".join(f"{statuses.count(kind)} {kind}" for kind in dict.fromkeys(statuses))
-        strips.append(
-            {"name": name, "stretches": stretches(frames, statuses, [""] * len(statuses)), "summary": counts}
-        )
+        strips.append({"name": name, "stretches": stretches(statuses), "summary": counts})
     return strips
 
 

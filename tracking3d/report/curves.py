@@ -10,8 +10,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tracking3d.estimation.estimate import Status
-
 WIDTH, HEIGHT = 1000.0, 100.0
 """The picture's own units: it is stretched to the page."""
 MOST_POINTS = 2000
@@ -104,66 +102,28 @@ def across(position: int, count: int) -> float:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames in a row that share status and reason.
+    """Frames in a row that share a status.
 
     Attributes:
         status: What they share.
-        reason: Why; empty if nothing was said.
-        first: Position of the first one.
-        last: Position of the last one.
-        first_index: Index of the first frame in the source, and of the last one.
-        last_index: See ``first_index``.
         x: Left edge in the picture.
         width: Width there.
     """
 
     status: str
-    reason: str
-    first: int
-    last: int
-    first_index: int
-    last_index: int
     x: float
     width: float
 
-    @property
-    def frames(self) -> str:
-        """Which frames, in words."""
-        if self.first == self.last:
-            return f"frame {self.first_index}"
-        return f"frames {self.first_index} to {self.last_index}"
 
-
-def stretches(indices: Sequence[int], statuses: Sequence[str], reasons: Sequence[str]) -> list[Stretch]:
-    """Frames in a row with one status and one reason, in order.
-
-    Figures within a reason do not part them, nor do the reasons of frames that are tracked.
+def stretches(statuses: Sequence[str]) -> list[Stretch]:
+    """Frames in a row with one status, in order.
 
     Args:
-        indices: Indices of the frames in the source.
         statuses: One a frame.
-        reasons: One a frame.
     """
-    kinds = [
-        (status, "" if status == Status.TRACKED else _kind(reason))
-        for status, reason in zip(statuses, reasons, strict=True)
-    ]
-    begins = [n for n in range(len(kinds)) if n == 0 or kinds[n] != kinds[n - 1]]
-    unit = WIDTH / max(len(kinds), 1)
+    begins = [n for n in range(len(statuses)) if n == 0 or statuses[n] != statuses[n - 1]]
+    unit = WIDTH / max(len(statuses), 1)
     return [
-        Stretch(
-            status=statuses[first],
-            reason=reasons[first],
-            first=first,
-            last=following - 1,
-            first_index=indices[first],
-            last_index=indices[following - 1],
-            x=first * unit,
-            width=(following - first) * unit,
-        )
-        for first, following in pairwise([*begins, len(kinds)])
+        Stretch(statuses[first], first * unit, (following - first) * unit)
+        for first, following in pairwise([*begins, len(statuses)])
     ]
-
-
-def _kind(reason: str) -> str:
-    return "".join(letter for letter in reason if not letter.isdigit())

@@ -1,9 +1,140 @@
-"""What limits how far a run can be trusted, in sentences, the most serious first."""
+"""How far a run can be trusted, what limits that, and what to do next, in sentences, the most important first."""
 
 from __future__ import annotations
 
-from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, ObjectModel, Status
+from tracking3d.results.description import for_new_folder
+from tracking3d.results.doubtful_frames import count_reasons
+from tracking3d.results.layout import has_state
+from tracking3d.results.notes import MOSTLY, is_lens_uncertain, unseen_share
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+
+_AGREEMENT = 0.8  # IoU with the mask tracker's mask from which a mask is plausible (chosen)
+_GROWTH = 1.5  # factor of the usual area within which a mask is plausible (chosen)
+_NEIGHBOURS = 9  # frames whose median area is the usual one (chosen)
+_FEW = 0.1  # share of implausible masks from which another tracker is advised (chosen)
+_BETTER_TRACKERS = {"csrt": "segment", "flow": "segment"}
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Something to do next.
+
+    Attributes:
+        what: A sentence.
+        commands: The command lines for it; capital words in them are to be filled in.
+    """
+
+    what: str
+    commands: tuple[str, ...]
+
+
+def outcome_of(run: RunReader) -> tuple[str, str]:
+    """What of a run can be used: a sentence on its masks, and one on its poses."""
+    records = run.frames
+    if not records:
+        return "none, no frame was estimated.", "none."
+    masks, tracked = int(plausible_masks(records).sum()), _tracked(records)
+    poses = f"reliable in {_of(tracked, len(records))}."
+    if 2 * tracked < len(records):
+        doubtful = [record for record in records if record.status is not Status.TRACKED]
+        why = count_reasons(doubtful)[0][0].partition(" (")[0]
+        poses = f"not reliable (tracked in {tracked} of {len(records)} frames){f': {why}' if why else ''}."
+    return f"plausible in {_of(masks, len(records))}.", poses
+
+
+def plausible_masks(records: Sequence[FrameRecord]) -> NDArray[np.bool_]:
+    """``(N,)``, whether a mask looks right as far as that can be told without the truth, whatever its pose.
+
+    It does if it is not empty, about as large as those of the frames around it, and, unless it is the mask tracker's
+    own, close to that one. What both get wrong is not seen: of 205 masks of five runs of real clips, 21 have an IoU
+    with the true ones below .7, of which 2 do not look right, beside 5 that are right.
+    """
+    areas = np.array([record.area for record in records], dtype=np.float64)
+    usual = median_filter(areas, _NEIGHBOURS, mode="mirror")
+    steady = (areas < _GROWTH * usual) & (usual < _GROWTH * areas)
+    return steady & (_agreements(records) >= _AGREEMENT)
+
+
+def _agreements(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
+    """``(N,)`` IoU with the mask tracker's masks; 1 if there are none, and 0 of empty masks."""
+    ious = [1.0 if record.iou_initial is None else record.iou_initial for record in records]
+    return np.where([record.area > 0 for record in records], ious, 0.0)
+
+
+def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
+    """What the user of a run can do next, the most useful first.
+
+    Args:
+        run: The run.
+        model: Its model; None if there is none.
+    """
+    records, name = run.frames, shlex.quote(str(run.folder))
+    command = str(run.description.get("command") or "")
+    if not command.startswith("tracking3d run "):  # a batch, or Python
+        source = shlex.quote(str(run.description.get("source", "VIDEO")))
+        command = f"tracking3d run {source} --box X,Y,WIDTH,HEIGHT"
+    command = for_new_folder(command)
+    again = f"{command} --out {shlex.quote(f'{run.folder}_again')}"
+    steps = []
+    if run.state not in ("finished", "running") and has_state(run.folder):
+        steps.append(Advice("Continue the run from where it stopped.", (f"{command} --resume",)))
+    if not records:
+        return steps
+    implausible = np.flatnonzero(~plausible_masks(records))
+    if len(implausible):
+        frame = records[implausible[_agreements(records)[implausible].argmin()]].index
+        steps.append(
+            Advice(
+                f"Look at the mask of frame {frame}. If it is wrong, give the object there once more; in the viewer it "
+                "can be drawn.",
+                (f"tracking3d correct {name} {frame}:X,Y,WIDTH,HEIGHT", f"tracking3d view {name}"),
+            )
+        )
+    better = _BETTER_TRACKERS.get((run.config.get("tracker") or {}).get("name", ""))
+    if len(implausible) > _FEW * len(records) and better:
+        steps.append(Advice("Try another mask tracker.", (f"{again} --tracker {better}",)))
+    reliable = 2 * _tracked(records) >= len(records)
+    if not reliable:
+        steps.append(
+            Advice(
+                "For poses, film the object again: printed, or with a few stickers on it, larger in the picture, and "
+                "turned by some tens of degrees.",
+                (),
+            )
+        )
+    if is_lens_uncertain(run.description["camera"]):
+        steps.append(
+            Advice("Give the camera's vertical field of view, if you know it.", (f"{again} --fov DEGREES",))
+        )
+    if reliable and model is not None and unseen_share(model) > MOSTLY:
+        extended = shlex.quote(f"{run.folder}_extended")
+        steps.append(
+            Advice(
+                "Film the other sides of the object too, and add them to the model.",
+                (
+                    f"tracking3d run SECOND_VIDEO --box X,Y,WIDTH,HEIGHT --object {name} --extend --out {extended}",
+                ),
+            )
+        )
+    if reliable:
+        take = Advice("Take poses, masks and model elsewhere.", (f"tracking3d export {name} --to blender",))
+    else:
+        take = Advice("Take the masks elsewhere.", (f"tracking3d export {name} --to coco",))
+    return [*steps, take]
+
+
+def _tracked(records: Sequence[FrameRecord]) -> int:
+    return sum(record.status is Status.TRACKED for record in records)
 
 
 def doubts_of(run: RunReader) -> list[str]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.report import figures
-from tracking3d.report.curves import Curve, Stretch, curve, stretches
-from tracking3d.report.doubts import doubts_of
+from tracking3d.report.curves import Curve, curve, stretches
+from tracking3d.report.doubts import doubts_of, next_steps, outcome_of
 from tracking3d.report.frame_pictures import FramePictures, frame_pictures, jpeg_of
 from tracking3d.report.model_data import middle_of, model_data, read_model
 from tracking3d.report.probability_layer import probability_layers
@@ -24,6 +24,7 @@ from tracking3d.report.rendering import render_page
 from tracking3d.report.settings import settings_of
 from tracking3d.report.turntable import write_turntable
 from tracking3d.results import layout
+from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.mesh_view import render_view, side_shown
 from tracking3d.results.notes import unseen_share
@@ -32,7 +33,7 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_progress
 
 _MOST_LISTED = 30
-"""Stretches of uncertain and lost frames that are named; the plots show all."""
+"""Ranges of uncertain and lost frames that are named; the plots show all."""
 _STILL = 480  # pixels a side
 _FASTEST = 30.0  # pictures a second
 _OBJECT_FOLDER = "object_"
@@ -92,12 +93,7 @@ def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64],
     records = run.frames
     pictures = frame_pictures(run)
     likely = probability_layers(run, pictures.positions)
-    parts = stretches(
-        [record.index for record in records],
-        [record.status.value for record in records],
-        [record.reason for record in records],
-    )
-    doubtful = [part for part in parts if part.status != Status.TRACKED]
+    doubtful = doubtful_ranges(records)
     counts = figures.status_counts(records)
     shares, refinement_time = figures.stage_shares(run), run.refinement_stages is not None
     in_parent = run.folder.resolve().name.startswith(_OBJECT_FOLDER)
@@ -108,6 +104,9 @@ def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64],
         index=in_parent and (run.folder / ".." / layout.INDEX).is_file(),
         counts=counts,
         facts=_facts(run),
+        outcome=outcome_of(run),
+        steps=next_steps(run, model),
+        files=_files(run.folder),
         doubts=doubts_of(run),
         count=len(records),
         pictures=pictures if pictures.jpegs else None,
@@ -117,7 +116,7 @@ def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64],
         no_model=no_model,
         still="" if model is None else _text(jpeg_of(render_view(model, front, _STILL))),
         seen="" if model is None else f"{100 * (1 - unseen_share(model)):.0f} %",
-        stretches=parts,
+        stretches=stretches([record.status.value for record in records]),
         status_summary=", ".join(f"{number} {status}" for status, number in counts.items()),
         curves=_curves(records, model),
         first_label=_label(records[0]) if records else "",
@@ -141,7 +140,7 @@ def _data(
     model: ObjectModel | None,
     pictures: FramePictures,
     likely: tuple[bytes | None, ...],
-    doubtful: list[Stretch],
+    doubtful: list[DoubtfulRange],
 ) -> dict[str, Any]:
     """What the page's script needs, as short as it goes: a run may have a hundred thousand frames."""
     records = run.frames
@@ -156,7 +155,7 @@ def _data(
         "keyframes": [number for number, record in enumerate(records) if record.keyframe],
         "reasons": list(reasons),
         "reason": [reasons[record.reason] for record in records],
-        "doubts": [part.first for part in doubtful],
+        "doubts": [part.position for part in doubtful],
         "pictured": pictures.positions,
         "pictures": [_text(jpeg) for jpeg in pictures.jpegs],
         "probabilities": [None if layer is None else _text(layer) for layer in likely],
@@ -207,10 +206,10 @@ def _own_overlap(record: FrameRecord) -> float:
     return math.nan if record.iou_initial is None or handed_back else record.iou_initial
 
 
-def _most_telling(doubtful: list[Stretch]) -> list[Stretch]:
-    """The longest stretches, lost ones first, in order of time."""
-    chosen = sorted(doubtful, key=lambda part: (part.status != Status.LOST, -part.width))[:_MOST_LISTED]
-    return sorted(chosen, key=lambda part: part.first)
+def _most_telling(doubtful: list[DoubtfulRange]) -> list[DoubtfulRange]:
+    """The longest ranges, lost ones first, in order of time."""
+    chosen = sorted(doubtful, key=lambda part: (part.status != Status.LOST, -part.count))[:_MOST_LISTED]
+    return sorted(chosen, key=lambda part: part.position)
 
 
 def _facts(run: RunReader) -> list[tuple[str, str]]:
@@ -228,6 +227,11 @@ def _facts(run: RunReader) -> list[tuple[str, str]]:
         ("Started", str(about.get("created", "")).replace("T", " ").replace("+00:00", " UTC")),
     ]
     return [(name, str(value)) for name, value in facts if value]
+
+
+def _files(folder: Path) -> list[str]:
+    names = [name for what, names in layout.OUTPUTS.items() if what != "report" for name in names]
+    return [name for name in names if (folder / name).exists()]
 
 
 def _machine(run: RunReader) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -54,6 +55,11 @@ class RunHeader:
     renderer: Mapping[str, str | int] | None = None
     given: Mapping[str, Any] | None = None
     tracker_choice: str | None = None
+
+
+def for_new_folder(command: str) -> str:
+    """The command line of a run without what it does about an earlier run in its folder."""
+    return re.sub(" --(overwrite|resume)(?= |$)", "", command)
 
 
 def description_at_start(header: RunHeader) -> dict[str, Any]:

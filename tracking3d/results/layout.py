@@ -72,6 +72,16 @@ EXPORT = "export"
 EXPORT_BEFORE = "export_before_correction"
 """What was exported of a run before it was corrected."""
 
+OUTPUTS = {
+    "poses": (FRAMES,),
+    "masks": (MASKS,),
+    "mesh": (OBJ, GLB),
+    "video": (OVERLAY,),
+    "contact sheet": (CONTACT_SHEET,),
+    "report": (REPORT,),
+}
+"""What a run is made for, and its files."""
+
 ARBITRARY, METRE = "arbitrary", "metre"
 """Units of length of a run: its own, and that of a run whose object was measured."""
 

@@ -52,7 +52,7 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
     """
     notes = []
     deviation = camera.get("focal_deviation")
-    if camera["assumed"] and (deviation is None or deviation > CERTAIN):
+    if is_lens_uncertain(camera):
         uncertain = "" if deviation is None else f", uncertain by {100 * deviation:.0f} % of the focal length"
         if deviation is not None and deviation > LENS_KNOWN:
             uncertain = ", and the video does not tell it"
@@ -66,6 +66,16 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
             "second video, and add them by --object RUN --extend"
         )
     return notes
+
+
+def is_lens_uncertain(camera: dict[str, Any]) -> bool:
+    """Whether nobody gave the focal length, and it could not be estimated well.
+
+    Args:
+        camera: As ``run.json`` has it.
+    """
+    deviation = camera.get("focal_deviation")
+    return camera["assumed"] and (deviation is None or deviation > CERTAIN)
 
 
 def notes_of_times(records: Sequence[FrameRecord]) -> list[str]:

@@ -19,6 +19,7 @@ from types import ModuleType
 from filelock import FileLock, Timeout
 
 from tracking3d.rendering.kernels.compilation import Kernel, announce_compilation
+from tracking3d.runtime.progress import report_each
 
 _FIRST = "tracking3d.estimation.online.optimization.kernels.pose_refinement"
 """Takes as long as ten others, and is needed soon."""
@@ -54,22 +55,39 @@ def find_kernels(module: ModuleType) -> list[Kernel]:
     ]
 
 
-def compile_in_background(quiet: bool = False) -> bool:
+def _all_kernels() -> list[Kernel]:
+    return [one for name in kernel_modules() for one in find_kernels(importlib.import_module(name))]
+
+
+def compile_with_progress() -> None:
+    """Compile the kernels that are not kept on disk, beside a process that does so in the background.
+
+    It is a stage with a count. Nothing is compiled if they cannot be kept.
+    """
+    kernels = _all_kernels()
+    missing = [one for one in reversed(kernels) if kernels[0].folder and not one.is_kept]
+    if missing:
+        compile_in_background()
+        # From the other end; what has been compiled in the background meanwhile is loaded.
+        for one in report_each(
+            "compiling kernels", sorted(missing, key=lambda one: one.__module__ == _FIRST)
+        ):
+            one.compile()
+
+
+def compile_in_background() -> bool:
     """Let a process of its own compile the kernels that are not kept on disk; it goes on when this one ends.
 
-    That is said once; of a process that is at it already, and of kernels that this process compiles from here on since
-    it needs them sooner, nothing more is said.
-
-    Args:
-        quiet: Say nothing at all.
+    Of kernels that this process needs sooner and compiles itself, nothing is said.
 
     Returns:
         Whether a process was started; not if all are kept, they cannot be kept, or another process is at it.
     """
-    kernels = [one for name in kernel_modules() for one in find_kernels(importlib.import_module(name))]
+    kernels = _all_kernels()
     folder = kernels[0].folder
     if folder is None or all(one.is_kept for one in kernels):
         return False
+    announce_compilation("", quiet=True)
     try:
         with FileLock(folder / _LOCK, timeout=0):
             alone = not _was_started(folder / _STARTED)
@@ -78,9 +96,7 @@ def compile_in_background(quiet: bool = False) -> bool:
     except (Timeout, OSError, NotImplementedError):
         alone = False
     if not alone:
-        announce_compilation("", quiet=True)
         return False
-    announce_compilation("this is done once, in the background", quiet)
     process = subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import main; main(in_background=True)"],
         stdin=subprocess.DEVNULL,

@@ -20,7 +20,8 @@ from pydantic import ValidationError
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.picker.correction import CorrectionPage, CorrectionProgress, DrawnCorrection
+from tracking3d.picker.correction import CorrectionPage, DrawnCorrection
+from tracking3d.picker.server import PageProgress
 from tracking3d.picker.session import PickingSession
 from tracking3d.results import layout
 from tracking3d.results.files import write_mask
@@ -53,7 +54,7 @@ class RunCorrection:
         self._process: Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
         self._frame = 0
-        self._ended = CorrectionProgress()
+        self._ended = PageProgress()
         self._busy = threading.RLock()
 
     @property
@@ -134,7 +135,7 @@ class RunCorrection:
             self._frame = drawn.frame
             self._process = Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=self._errors)
 
-    def progress(self) -> CorrectionProgress:
+    def progress(self) -> PageProgress:
         """How far it is."""
         with self._busy:
             if self._process is not None and self._process.poll() is not None:
@@ -148,10 +149,10 @@ class RunCorrection:
             for path in (stage / layout.FRAMES, stage / layout.REFINING / layout.FRAMES)
         )
         if not done:
-            return CorrectionProgress(True, f"Correcting frame {self._frame}: starting …")
+            return PageProgress(True, f"Correcting frame {self._frame}: starting …")
         progress = f"{again} of {total} refined" if again else f"{done} of {total} frames estimated"
         share = (done + again) / (2 * total if self.run.refined else total)
-        return CorrectionProgress(True, f"Correcting frame {self._frame}: {progress}.", share=min(share, 1.0))
+        return PageProgress(True, f"Correcting frame {self._frame}: {progress}.", share=min(share, 1.0))
 
     def close(self) -> None:
         """Stop serving; a correction that goes on is stopped, and can go on by the command."""
@@ -167,18 +168,18 @@ class RunCorrection:
         with self._busy:
             self.progress()  # lets go of what belongs to a process that has ended
 
-    def _end(self, code: int) -> CorrectionProgress:
+    def _end(self, code: int) -> PageProgress:
         assert self._errors is not None
         self._errors.seek(0)
         lines = self._errors.read(1 << 16).decode("utf-8", "replace").splitlines()
         self._errors.close()
         (self.run.folder / layout.DRAWN).unlink(missing_ok=True)
         if code == 0:
-            return CorrectionProgress(sentence=f"Frame {self._frame} is corrected.")
+            return PageProgress(sentence=f"Frame {self._frame} is corrected.")
         message = next(
             (line for line in lines if line.startswith("error: ")), "error: the correction was stopped."
         )
-        return CorrectionProgress(
+        return PageProgress(
             sentence=f"The correction failed and the run is unchanged: {message.removeprefix('error: ')}",
             failed=True,
         )

@@ -11,19 +11,20 @@ from typing import Any
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.results import drawing
+from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
 from tracking3d.results.drawing import Colour
 from tracking3d.results.records import FrameRecord
-from tracking3d.viewer.followed_run import FollowedRun, Streak
+from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.timeline import hexadecimal, jump
 
 LONGEST_LIST = 200
 """Maximum entries in the list of uncertain and lost frames; the rest is only counted."""
 
 
-def list_streaks(runs: Sequence[FollowedRun]) -> str:
+def list_doubtful_frames(runs: Sequence[FollowedRun]) -> str:
     """The uncertain and lost frames of all runs with their reasons; a click goes to a frame."""
-    rows = [(run, streak) for run in runs for streak in run.streaks()]
-    items = "".join(_row(run, streak, len(runs) > 1) for run, streak in rows[:LONGEST_LIST])
+    rows = [(run, doubtful) for run in runs for doubtful in doubtful_ranges(list(run.frames.values()))]
+    items = "".join(_row(run, doubtful, len(runs) > 1) for run, doubtful in rows[:LONGEST_LIST])
     if not rows:
         items = "<p>No frame is uncertain or lost.</p>"
     elif len(rows) > LONGEST_LIST:
@@ -83,13 +84,12 @@ def _badge(status: Status) -> str:
     )
 
 
-def _row(run: FollowedRun, streak: Streak, named: bool) -> str:
-    frames = f"{streak.first}" if streak.first == streak.last else f"{streak.first} to {streak.last}"
+def _row(run: FollowedRun, doubtful: DoubtfulRange, named: bool) -> str:
     name = f"{html.escape(run.name)}, " if named else ""
-    going = jump(str(streak.first))
+    going = jump(str(doubtful.first))
     return (
         f'<div class="streak" role="button" tabindex="0" onclick="{going}" '
         f'onkeydown="if(event.key===\'Enter\')this.click()" style="cursor:pointer;padding:3px 0">'
-        f"{_badge(streak.status)} {name}<b>{frames}</b>: "
-        f"{html.escape(streak.reason) or 'no reason given'}</div>"
+        f"{_badge(doubtful.status)} {name}<b>{doubtful.frames}</b>: "
+        f"{html.escape(doubtful.reason) or 'no reason given'}</div>"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
@@ -20,26 +19,8 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord, latest
 from tracking3d.results.run_reader import LONGEST_LINE, RunReader
 
-_FIGURES = re.compile(r"[\d.]+")
 _MOST_AT_ONCE = 2**26
 """Bytes of new lines that are taken at a time; the rest comes with the next look."""
-
-
-@dataclass(frozen=True)
-class Streak:
-    """Consecutive frames that are uncertain or lost for the same reason.
-
-    Attributes:
-        first: Index of the first frame.
-        last: Index of the last one.
-        status: What the run says of them.
-        reason: Why; figures in it are those of the first frame.
-    """
-
-    first: int
-    last: int
-    status: Status
-    reason: str
 
 
 @dataclass(eq=False)
@@ -112,24 +93,6 @@ class FollowedRun:
         camera = self.camera
         return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
 
-    def streaks(self) -> list[Streak]:
-        """The frames that are uncertain or lost, those in a row together."""
-        found: list[Streak] = []
-        for index, record in self.frames.items():
-            if record.status == Status.TRACKED:
-                continue
-            last = found[-1] if found else None
-            if (
-                last
-                and last.last == index - 1
-                and last.status == record.status
-                and _alike(last.reason, record.reason)
-            ):
-                found[-1] = Streak(last.first, index, last.status, last.reason)
-            else:
-                found.append(Streak(index, index, record.status, record.reason))
-        return found
-
     def _look_at_description(self) -> bool:
         try:
             reader = RunReader(self.folder)
@@ -179,11 +142,6 @@ class FollowedRun:
             return False
         self._model_time = written
         return True
-
-
-def _alike(reason: str, other: str) -> bool:
-    """Whether two reasons are the same but for their figures."""
-    return reason == other or _FIGURES.sub("", reason) == _FIGURES.sub("", other)
 
 
 def open_followed_runs(folder: Path) -> list[FollowedRun]:

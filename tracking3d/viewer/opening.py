@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from tracking3d.viewer.viewer import Viewer
     from tracking3d.web.access import Access
 
+_log = logging.getLogger(__name__)
 PORT = 8080
 """Where the viewer listens, or the next port that is free."""
 
@@ -73,6 +75,8 @@ def open_viewer(
         if not runs:
             raise InputError(f"{folder} holds no run; give the --out folder of a `tracking3d run`.")
         own = images or images_of_run(str(runs[0].description.get("source", "")), runs[0].folder)
+        if own is None:
+            _log.warning("The video of the run %s was not found; give its path as --source.", folder)
         corrections += [RunCorrection(run, own, source, access) for run in runs]
         videos.append(Video(folder.name or str(folder), runs, own or _drawn_images_of(runs[0])))
     return Viewer(videos, access, port, Corrections(corrections, access))

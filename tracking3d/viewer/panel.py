@@ -12,15 +12,19 @@ from tracking3d.viewer.picture import LAYERS, Shown
 VIDEO_WIDTH, VIDEOS_WIDTH = 560, 720
 """Pixels of the panel with the video, or with several."""
 SPEEDS = {"¼ x": 0.25, "½ x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_ON_A_PHONE = """<style>
+_SIZES = """<style>
+img[src^="blob:"] { max-height: min(70vh, 100vh - 310px); margin: 0 auto; }
 @media (max-width: 36em) {
   .mantine-Paper-root[style*="position: fixed"],
   .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100% !important; }
+  .mantine-Paper-root[style*="position: fixed"] { max-height: 74% !important; }
   body:has([style*="width: 20em"] > div > [style*="grid-template-rows: 1fr"])
-    div[style*="flex-grow: 1; height: 100%"] { height: 42% !important; }
+    div[style*="flex-grow: 1; height: 100%"] { height: 26% !important; }
+  img[src^="blob:"] { max-height: 42vh; }
 }
 </style>"""
-"""Viser's panel on a phone leaves a strip next to it and hides the middle of the model. If a version of viser is made
+"""The picture with timeline, slider and Play under it fits the window, and on a phone it is larger than the model.
+Viser's panel on a phone leaves a strip next to it and hides the middle of the model. If a version of viser is made
 otherwise, this says nothing."""
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
 _STEP_HINT = "Previous uncertain or lost frame, previous frame, next frame, next uncertain or lost frame."
@@ -43,7 +47,7 @@ class Panel:
         # The video is in viser's own panel, which a phone shows open; there the others are a tap away.
         blank: Image = np.full((9, 16, 3), 40, np.uint8)
         self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=85)
-        gui.add_html(_ON_A_PHONE)
+        gui.add_html(_SIZES)
         self.timeline = gui.add_html("")
         self.slider = gui.add_slider(timeline.SLIDER, 0, 1, 1, 0)
         self.play = gui.add_button("Play", hint="Key P.")

@@ -18,6 +18,7 @@ import numpy as np
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results import layout
+from tracking3d.results.doubtful_frames import doubtful_ranges
 from tracking3d.results.drawing import Colour
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
@@ -25,7 +26,7 @@ from tracking3d.viewer import timeline
 from tracking3d.viewer.browser_camera import look_from_aside, look_through
 from tracking3d.viewer.checkpoint_landmarks import landmarks_of_checkpoint
 from tracking3d.viewer.correcting import Corrections
-from tracking3d.viewer.descriptions import about, describe_frame, list_streaks
+from tracking3d.viewer.descriptions import about, describe_frame, list_doubtful_frames
 from tracking3d.viewer.first_look import radius_of, stack_objects
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
@@ -164,7 +165,9 @@ class Viewer:
             step = 1 if way == "▶" else -1
             self.go_to(self._indices[min(max(place + step, 0), len(self._indices) - 1)])
             return
-        starts = sorted({streak.first for run in self._runs for streak in run.streaks()})
+        starts = sorted(
+            {one.first for run in self._runs for one in doubtful_ranges(list(run.frames.values()))}
+        )
         found = [start for start in starts if (start > self._wanted if way == "▶▶" else start < self._wanted)]
         if found:
             self.go_to(found[0] if way == "▶▶" else found[-1])
@@ -288,7 +291,7 @@ class Viewer:
             panel.quantity.options = offered
         if draw:
             self._draw_scene()
-            panel.doubts.content = list_streaks(self._runs)
+            panel.doubts.content = list_doubtful_frames(self._runs)
             panel.about.content = "".join(about(run) for run in self._runs)
         self._redraw_timeline()
         if panel.follow.value and self._indices:

@@ -25,6 +25,9 @@ let zoom = 1;
 let asked = 0; // number of the last question for a mask
 let present = null; // the mask that the run has of this frame, if a run is corrected
 let running = false; // whether the run is being corrected
+let veils = null; // the masks of the run's latest frame, once it has started
+let viewer = null; // its address, once it is open
+let stopped = false; // whether it was stopped from here
 
 const one = () => objects[current];
 const isEmpty = (object) => !object.box && !object.points.length && !object.strokes.length;
@@ -84,8 +87,9 @@ function draw() {
   if (picture) context.drawImage(picture, 0, 0, canvas.width, canvas.height);
   const unit = session.width / canvas.clientWidth; // frame pixels of a pixel of the screen
   if (present && !(one().frame === frame && one().veil)) context.drawImage(present, 0, 0);
+  for (const veil of veils ?? []) context.drawImage(veil, 0, 0);
   objects.forEach((object, number) => {
-    if (object.frame !== frame) return;
+    if (object.frame !== frame || veils) return;
     context.globalAlpha = number === current ? 1 : 0.6;
     if (object.veil) context.drawImage(object.veil, 0, 0);
     if (number !== current) return;
@@ -362,7 +366,9 @@ function offerSettings() {
   byId("settings").hidden = false;
   for (const control of document.querySelectorAll("[data-setting]")) {
     const words = session.choices[control.dataset.setting];
-    if (words) control.replaceChildren(new Option("", ""), ...words.map((word) => new Option(word, word)));
+    const use = (word) => control.dataset.setting === "tracker" && session.tracker_for[word];
+    const line = (word) => (use(word) ? `${word}: ${use(word)}` : word);
+    if (words) control.replaceChildren(new Option("", ""), ...words.map((word) => new Option(line(word), word)));
     control.addEventListener("change", () => { settled = settled.then(changeSettings); });
   }
   showSettings();
@@ -437,11 +443,72 @@ byId("start").addEventListener("click", async () => {
   if (session.correcting) return correct();
   const told = await end("start");
   if (!told) return;
-  for (const control of document.querySelectorAll("button, input, select")) control.disabled = true;
-  canvas.style.pointerEvents = "none";
-  byId("told").hidden = false;
   byId("told").textContent = told.command;
-  say("The run has started; its progress is shown in the terminal. You can close this page.");
+  watch();
+});
+
+// ---- the run, once it has started ----
+
+function watch() {
+  document.querySelector("h1").textContent = "The run";
+  for (const part of document.querySelectorAll("aside > *")) {
+    part.hidden = !["source", "status", "progress", "run", "told"].includes(part.id) && part.tagName !== "H1";
+  }
+  byId("told").hidden = !byId("told").textContent;
+  byId("time").hidden = true;
+  resize();
+  canvas.style.pointerEvents = "none";
+  veils = [];
+  follow();
+}
+
+const loaded = async (address) => {
+  const image = Object.assign(new Image(), { src: address });
+  await image.decode();
+  return image;
+};
+
+// The latest frame with the masks of its objects.
+async function showLatest(told) {
+  try {
+    const [image, ...masks] = await Promise.all([`frame/${told.frame}.jpg`, ...told.veils].map(loaded));
+    [picture, veils, frame] = [image, masks, told.frame];
+    draw();
+  } catch {
+    // the next one will do
+  }
+}
+
+function link(address, text) {
+  const line = document.createElement("div");
+  line.append(Object.assign(document.createElement("a"), { href: address, target: "_blank", textContent: text }));
+  return line;
+}
+
+function showRun(told) {
+  if (told.frame !== null) showLatest(told);
+  byId("stop").hidden = !told.running;
+  byId("viewer").hidden = viewer || !told.viewer || (told.running && told.frame === null);
+  const name = (number) => (told.reports.length > 1 ? `Report of ${objects[number]?.name ?? number}` : "Report");
+  byId("links").replaceChildren(...told.reports.map((address, number) => link(address, name(number))),
+    ...(viewer ? [link(viewer, "Viewer")] : []));
+  setTimeout(follow, told.running ? 1000 : 20000); // to say that the page is still open
+}
+
+byId("stop").addEventListener("click", async () => {
+  stopped = byId("stop").disabled = true;
+  await ask("stop", {}).catch(() => null);
+});
+byId("viewer").addEventListener("click", async () => {
+  byId("viewer").disabled = true;
+  try {
+    viewer = new URL((await ask("view", {})).address);
+    viewer.hostname = location.hostname; // the browser may know this machine by another name
+    byId("links").append(link(viewer, "Viewer"));
+    byId("viewer").hidden = true;
+  } catch (error) {
+    say(error.message, true);
+  }
 });
 
 // ---- a run that is there is corrected ----
@@ -478,11 +545,14 @@ async function follow() {
   try {
     told = await (await fetch("progress.json")).json();
   } catch {
-    return say("The viewer was closed; its unfinished correction was stopped.", true);
+    if (session.correcting) return say("The viewer was closed; its unfinished correction was stopped.", true);
+    byId("run").hidden = byId("progress").hidden = true;
+    return say(stopped ? "The run was stopped. Repeat tracking3d pick, or add --resume to the command below, and it goes on from there."
+      : "The program has ended; see the terminal.", !stopped);
   }
-  byId("start").disabled = told.running || isEmpty(one());
+  if (!veils) byId("start").disabled = told.running || isEmpty(one());
   if (told.sentence) say(told.sentence, told.failed);
-  if (running && !told.running && !told.failed) {
+  if (!veils && running && !told.running && !told.failed) {
     objects = [newObject()]; // the drawing is in the run now
     showPresent();
     list();
@@ -491,6 +561,7 @@ async function follow() {
   byId("progress").hidden = !told.running;
   if (told.share === null) byId("progress").removeAttribute("value");
   else byId("progress").value = told.share;
+  if (veils) return showRun(told);
   if (told.running) setTimeout(follow, 700);
 }
 
@@ -518,7 +589,8 @@ async function open() {
   resize();
   goTo(Number(/^#frame=(\d{1,9})$/.exec(location.hash)?.[1] ?? frame));
   window.addEventListener("resize", resize);
-  if (session.correcting) offerCorrection();
+  if (session.started) watch();
+  else if (session.correcting) offerCorrection();
   else if (session.choices) offerSettings();
 }
 
