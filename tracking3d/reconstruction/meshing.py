@@ -102,7 +102,7 @@ def unwrap(vertices: NDArray[np.float64], faces: NDArray[np.int64], size: int = 
         import xatlas
     except ImportError:
         _log.warning(
-            "xatlas is not installed (it has no wheel for some systems): each two faces of the mesh have a piece of the "
+            "xatlas is not installed (some systems have no wheel): each two faces of the mesh have a piece of the "
             "texture of their own, which is hard to paint on. Install it, and run `tracking3d model`."
         )
         return cell_atlas(len(faces))[0]
