@@ -94,15 +94,10 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StartOfModel:
-    """Where the model that is refined started.
+    """Where the model that is refined started."""
 
-    Attributes:
-        frame: Index of the frame.
-        reason: Why it started there, in words.
-    """
-
-    frame: int
-    reason: str
+    frame: int  # index of the frame
+    reason: str  # why it started there, in words
 
 
 def refinement(
