@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from packaging.requirements import Requirement
 
 pytest.importorskip("skimage")
 pytest.importorskip("fast_simplification")
-pytest.importorskip("xatlas")
 
 from tracking3d.reconstruction.grid import Grid
 from tracking3d.reconstruction.meshing import (
@@ -20,6 +24,7 @@ from tracking3d.reconstruction.meshing import (
     simplify,
     unwrap,
 )
+from tracking3d.reconstruction.rebuild import has_packages
 from tracking3d.rendering import TexelMap
 
 
@@ -58,8 +63,33 @@ def test_every_face_has_texels_of_its_own(ring, made_by):
     if made_by == "cells":
         uvs, size = cell_atlas(len(mesh.faces))
     else:
+        pytest.importorskip("xatlas")
         uvs, size = unwrap(np.asarray(mesh.vertices), np.asarray(mesh.faces)), 512
     assert uvs.min() >= 0 and uvs.max() <= 1
     texels = TexelMap.of(torch.from_numpy(uvs).float(), size)
     assert len(np.unique(texels.face.numpy())) > 0.97 * len(mesh.faces)
     assert (texels.barycentric > -1e-3).all()
+
+
+def test_without_xatlas_every_two_faces_have_a_chart_and_that_is_told(ring, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    uvs = unwrap(np.asarray(ring.vertices), np.asarray(ring.faces))
+    np.testing.assert_array_equal(uvs, cell_atlas(len(ring.faces))[0])
+    assert "xatlas is not installed" in caplog.text
+    assert has_packages()
+
+
+@pytest.mark.parametrize(
+    ("python", "system", "machine", "asked"),
+    [
+        ("3.12", "linux", "x86_64", True),
+        ("3.12", "linux", "aarch64", False),
+        ("3.12", "darwin", "arm64", True),
+        ("3.14", "win32", "AMD64", False),
+    ],
+)
+def test_xatlas_is_asked_for_only_where_it_has_wheels(python, system, machine, asked):
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    [needed] = [one for one in map(Requirement, project["dependencies"]) if one.name == "xatlas"]
+    where = {"python_version": python, "sys_platform": system, "platform_machine": machine}
+    assert (needed.marker is None or needed.marker.evaluate(where)) is asked

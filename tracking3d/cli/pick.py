@@ -220,7 +220,6 @@ def open_picker(
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
     from tracking3d.results.overwrite import check_output_folder
-    from tracking3d.speed.kernels_ahead import compile_in_background
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.selection import within
@@ -237,7 +236,6 @@ def open_picker(
         raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")
     images = frame_images(opened)
     indices = within(selection, images.count or opened.count or 1)
-    compile_in_background()
     session = PickingSession(source, images, indices, request.config, menu)
 
     def save(picked: Picked) -> tuple[str, str]:

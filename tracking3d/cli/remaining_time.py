@@ -23,17 +23,12 @@ _OVERDUE = 0.25  # what takes longer than expected will take this much longer st
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """A stage that is to come.
+    """A stage that is to come."""
 
-    Attributes:
-        name: As `StageProgress.name` has it.
-        seconds: What it costs, on the machine that the plan was made on.
-        steps: How many steps are planned; if the stage turns out to have more or fewer, it costs in proportion. None
-            if the cost does not depend on them.
-    """
-
-    name: str
-    seconds: float
+    name: str  # as `StageProgress.name` has it
+    seconds: float  # what it costs, on the machine that the plan was made on
+    # How many steps are planned; if the stage turns out to have more or fewer, it costs in proportion. None if the
+    # cost does not depend on them.
     steps: int | None = None
 
 

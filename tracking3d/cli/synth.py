@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +14,7 @@ from tracking3d.cli.fresh import Count, Meshes, draw_suite
 from tracking3d.cli.options import Debug, Quiet, grouped, numbers
 from tracking3d.cli.options.panels import OUTPUT, PERFORMANCE
 from tracking3d.errors import InputError
+from tracking3d.runtime.progress import report_progress
 
 if TYPE_CHECKING:
     from tracking3d.synthesis.spec import SequenceSpec
@@ -160,11 +161,13 @@ def synth(
 def _make_suite(
     name: str, drawn: list[SequenceSpec] | None, out: Path, jobs: int, overwrite: bool, quiet: bool
 ) -> list[Path]:
+    from tracking3d.cli.progress import show_progress
     from tracking3d.synthesis.suite import load_suite, make_suite
 
     specs = load_suite(name) if drawn is None else drawn
-    with _progress(len(specs), "sequences", quiet) as advance:
-        folders = make_suite(name, out, specs=specs, jobs=jobs, overwrite=overwrite, listener=advance)
+    with show_progress(quiet):
+        listener = _count("rendering sequences", len(specs))
+        folders = make_suite(name, out, specs=specs, jobs=jobs, overwrite=overwrite, listener=listener)
     if not quiet:
         typer.echo(f"{out}: {len(folders)} sequences")
     return folders
@@ -180,6 +183,7 @@ def _export(folders: list[Path], bop: Path, quiet: bool) -> None:
 
 
 def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool) -> list[Path]:
+    from tracking3d.cli.progress import show_progress
     from tracking3d.synthesis.spec import check_spec
     from tracking3d.synthesis.writing import is_complete, write_sequence
 
@@ -191,8 +195,8 @@ def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool)
     values["disturbances"] = dict(_strength(item) for item in values.pop("disturb", []))
     spec = check_spec(values, "synth")
     if overwrite or not is_complete(out, spec):
-        with _progress(spec.frames, "frames", quiet) as advance:
-            write_sequence(out, spec, lambda frame: advance(f"frame {frame}"))
+        with show_progress(quiet):
+            write_sequence(out, spec, _count("rendering frames", spec.frames))
     if not quiet:
         typer.echo(f"{out}: {spec.frames} frames")
     return [out]
@@ -206,23 +210,8 @@ def _strength(item: str) -> tuple[str, float]:
     return name.strip(), numbers(value, 1, f"--disturb {name}", "a number from 0 to 1")[0]
 
 
-@contextmanager
-def _progress(total: int, what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A progress bar on the standard error; yields the function to call with the name of each finished part."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    bar = Progress(
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TextColumn(what),
-        TextColumn("{task.fields[done]}"),
-        TimeRemainingColumn(compact=True),
-        console=console,
-        disable=quiet or not console.is_terminal,
-        transient=True,
-    )
-    task = bar.add_task("", total=total, done="")
-    with bar:
-        yield lambda name: bar.update(task, advance=1, done=name)
+def _count(stage: str, total: int) -> Callable[[object], None]:
+    """A function to call when a part of a stage is finished."""
+    done = count(1)
+    report_progress(stage, 0, total)
+    return lambda part: report_progress(stage, next(done), total)

@@ -25,46 +25,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a run tracks, and the folder it writes.
+    """What a run tracks, and the folder it writes."""
 
-    Attributes:
-        source: The command's argument SOURCE.
-        config: The configuration.
-        folder: The run folder.
-        prompts: The objects; none if the mask tracker or a known object replaces the prompt.
-        options: How the run is recorded, ``selection`` of the frames included.
-        corrections: Prompts in later frames.
-        skip_damaged: If the first frame cannot be decoded, apply the prompts to the first frame that can.
-        fps: Frame rate of a source that has no timestamps.
-    """
-
-    source: str
-    config: PipelineConfig
-    folder: Path
-    prompts: PromptSet
-    options: RecordOptions
-    corrections: Sequence[Correction] = ()
-    skip_damaged: bool = False
-    fps: float | None = None
+    source: str  # the command's argument SOURCE
+    config: PipelineConfig  # the configuration
+    folder: Path  # the run folder
+    prompts: PromptSet  # the objects; none if the mask tracker or a known object replaces the prompt
+    options: RecordOptions  # how the run is recorded, selection of the frames included
+    corrections: Sequence[Correction] = ()  # prompts in later frames
+    skip_damaged: bool = (
+        False  # if the first frame cannot be decoded, apply the prompts to the first frame that can
+    )
+    fps: float | None = None  # frame rate of a source that has no timestamps
 
 
 @dataclass(frozen=True)
 class RunDisplay:
-    """What a run shows while it is tracked, and at its end.
+    """What a run shows while it is tracked, and at its end."""
 
-    Attributes:
-        quiet: Print errors only.
-        report: Write a report at the end.
-        view: Show the run in the browser.
-        host: Address of this machine that the page is served on; this machine only if None.
-        page: The page on which the object was picked, which shows the run then; None without it.
-    """
-
-    quiet: bool = False
-    report: bool = True
-    view: bool = False
-    host: str | None = None
-    page: Picker | None = None
+    quiet: bool = False  # print errors only
+    report: bool = True  # write a report at the end
+    view: bool = False  # show the run in the browser
+    host: str | None = None  # address of this machine that the page is served on; this machine only if None
+    page: Picker | None = (
+        None  # the page on which the object was picked, which shows the run then; None without it
+    )
 
 
 def track(request: RunRequest, display: RunDisplay) -> None:

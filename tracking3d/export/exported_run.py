@@ -30,21 +30,13 @@ FRAMES_PER_SECOND = 30.0
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """A frame whose pose can be relied on.
+    """A frame whose pose can be relied on."""
 
-    Attributes:
-        index: Its index in the source.
-        seconds: Time since the source's start, None if not known.
-        T_cam_obj: ``(4, 4)`` float64, with the translation in the unit of the export.
-        camera: The camera that the pose is of.
-        record: Everything else that the run knows of it; lengths there are in the run's unit.
-    """
-
-    index: int
-    seconds: float | None
-    T_cam_obj: NDArray[np.float64]
-    camera: Camera
-    record: FrameRecord
+    index: int  # its index in the source
+    seconds: float | None  # time since the source's start, None if not known
+    T_cam_obj: NDArray[np.float64]  # (4, 4) float64, with the translation in the unit of the export
+    camera: Camera  # the camera that the pose is of
+    record: FrameRecord  # everything else that the run knows of it; lengths there are in the run's unit
 
     def T_through(self, camera: Camera) -> NDArray[np.float64]:
         """The pose for a format that has one lens for all frames, ``camera``.

@@ -15,19 +15,14 @@ from tracking3d.rendering import render, sample_texture, visible_vertices
 
 @dataclass(frozen=True, eq=False)
 class SeenSurface:
-    """V vertices in N frames with a pose.
+    """V vertices in N frames with a pose."""
 
-    Attributes:
-        points: ``(V, 3)`` object coordinates in the unit of the export.
-        colours: ``(V, 3)`` uint8 RGB.
-        pixels: ``(N, V, 2)`` where they are; (0, 0) is the centre of the top-left pixel.
-        seen: ``(N, V)`` whether they are seen: in the frame, unhidden, and within the estimated mask.
-    """
-
-    points: NDArray[np.float64]
-    colours: NDArray[np.uint8]
-    pixels: NDArray[np.float64]
-    seen: NDArray[np.bool_]
+    points: NDArray[np.float64]  # (V, 3) object coordinates in the unit of the export
+    colours: NDArray[np.uint8]  # (V, 3) uint8 RGB
+    pixels: NDArray[np.float64]  # (N, V, 2) where they are; (0, 0) is the centre of the top-left pixel
+    seen: NDArray[
+        np.bool_
+    ]  # (N, V) whether they are seen: in the frame, unhidden, and within the estimated mask
 
 
 def find_seen_surface(run: ExportedRun) -> SeenSurface:

@@ -19,17 +19,11 @@ from tracking3d.web.access import Access
 
 @dataclass(frozen=True, eq=False)
 class DrawnCorrection:
-    """The drawing: a box if that is sufficient, else a mask.
+    """The drawing: a box if that is sufficient, else a mask."""
 
-    Attributes:
-        frame: Index of the frame.
-        box: ``(x, y, width, height)`` in pixels, or None.
-        mask: ``(H, W)`` bool, or None.
-    """
-
-    frame: int
-    box: Box | None = None
-    mask: NDArray[np.bool_] | None = None
+    frame: int  # index of the frame
+    box: Box | None = None  # (x, y, width, height) in pixels, or None
+    mask: NDArray[np.bool_] | None = None  # (H, W) bool, or None
 
 
 class CorrectionPage(Picker):

@@ -20,17 +20,11 @@ class _Drawn(BaseModel):
 
 
 class Point(_Drawn):
-    """A click.
+    """A click."""
 
-    Attributes:
-        x: Column in pixels.
-        y: Row in pixels.
-        on: Whether it is on the object, or on the background.
-    """
-
-    x: Pixel
-    y: Pixel
-    on: bool
+    x: Pixel  # column in pixels
+    y: Pixel  # row in pixels
+    on: bool  # whether it is on the object, or on the background
 
 
 class Stroke(_Drawn):

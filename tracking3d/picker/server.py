@@ -57,36 +57,22 @@ _POLICY = (
 
 @dataclass(frozen=True)
 class PageProgress:
-    """How far a run or a correction is.
+    """How far a run or a correction is."""
 
-    Attributes:
-        running: Whether it goes on.
-        sentence: How far, or how it ended; empty if there was none.
-        failed: Whether it ended without a result.
-        share: What is done of it, in [0, 1]; None if unknown.
-        frame: Index of the latest frame that was estimated; None if there is none.
-    """
-
-    running: bool = False
-    sentence: str = ""
-    failed: bool = False
-    share: float | None = None
-    frame: int | None = None
+    running: bool = False  # whether it goes on
+    sentence: str = ""  # how far, or how it ended; empty if there was none
+    failed: bool = False  # whether it ended without a result
+    share: float | None = None  # what is done of it, in [0, 1]; None if unknown
+    frame: int | None = None  # index of the latest frame that was estimated; None if there is none
 
 
 @dataclass(frozen=True)
 class ShownRun:
-    """The run that a page shows once it has started.
+    """The run that a page shows once it has started."""
 
-    Attributes:
-        folders: The run folders of its objects.
-        progress: How far it is.
-        view: Opens the viewer, and gives its address; None without it.
-    """
-
-    folders: Sequence[Path]
-    progress: Callable[[], PageProgress]
-    view: Callable[[], str] | None = None
+    folders: Sequence[Path]  # the run folders of its objects
+    progress: Callable[[], PageProgress]  # how far it is
+    view: Callable[[], str] | None = None  # opens the viewer, and gives its address; None without it
 
 
 class Picker:

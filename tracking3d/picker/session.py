@@ -26,21 +26,15 @@ _VEIL = 110  # of 255: how much a mask hides of the frame
 
 @dataclass(frozen=True, eq=False)
 class Picked:
-    """What was picked.
+    """What was picked."""
 
-    Attributes:
-        frame: Index of the frame that it was picked in, which the run begins with.
-        objects: What was drawn.
-        boxes: One ``(x, y, width, height)`` for each object, if boxes are enough, else none.
-        masks: One ``(H, W)`` bool for each object, if they are not, else none.
-        config: The settings that were chosen on the page; None if it offers none.
-    """
-
-    frame: int
-    objects: tuple[DrawnObject, ...]
+    frame: int  # index of the frame that it was picked in, which the run begins with
+    objects: tuple[DrawnObject, ...]  # what was drawn
+    # one (x, y, width, height) for each object, if boxes are enough, else none
     boxes: list[Box] = field(default_factory=list)
+    # one (H, W) bool for each object, if they are not, else none
     masks: list[NDArray[np.bool_]] = field(default_factory=list)
-    config: PipelineConfig | None = None
+    config: PipelineConfig | None = None  # the settings that were chosen on the page; None if it offers none
 
 
 class PickingSession:

@@ -30,37 +30,25 @@ Pixels = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ChosenSettings(BaseModel):
-    """What was chosen; None stands for what is below it: quality, preset and configuration file.
-
-    Attributes:
-        tracker: Name of the mask tracker, as ``--tracker`` takes it.
-        quality: As ``--quality`` takes it.
-        model: The final mesh, as ``--model`` takes it.
-        features: Name of the feature encoder, as ``--features`` takes it.
-        fov: Vertical field of view in degrees, as ``--fov`` takes it.
-        intrinsics: ``(fx, fy, cx, cy)`` in pixels, as ``--intrinsics`` takes them.
-    """
+    """What was chosen; None stands for what is below it: quality, preset and configuration file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    tracker: Word | None = None
-    quality: Word | None = None
-    model: Word | None = None
-    features: Word | None = None
-    fov: Pixels | None = None
+    tracker: Word | None = None  # name of the mask tracker, as --tracker takes it
+    quality: Word | None = None  # as --quality takes it
+    model: Word | None = None  # the final mesh, as --model takes it
+    features: Word | None = None  # name of the feature encoder, as --features takes it
+    fov: Pixels | None = None  # vertical field of view in degrees, as --fov takes it
+    # (fx, fy, cx, cy) in pixels, as --intrinsics takes them
     intrinsics: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
 
 
 @dataclass(frozen=True)
 class SettingsMenu:
-    """The settings that can be chosen on the page.
+    """The settings that can be chosen on the page."""
 
-    Attributes:
-        chosen: Those that are chosen at first.
-        configure: Makes the configuration of a run from them; raises a `Tracking3dError` if it cannot.
-    """
-
-    chosen: ChosenSettings
+    chosen: ChosenSettings  # those that are chosen at first
+    # makes the configuration of a run from them; raises a `Tracking3dError` if it cannot
     configure: Callable[[ChosenSettings], PipelineConfig]
 
 

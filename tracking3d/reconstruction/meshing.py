@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.reconstruction.grid import FloatArray, Grid
 
+_log = logging.getLogger(__name__)
 SMALLEST_PIECE = 0.1
 """Share of the largest piece's volume below which a piece is a crumb."""
 
@@ -91,8 +94,18 @@ def cell_atlas(faces: int) -> tuple[NDArray[np.float64], int]:
 
 
 def unwrap(vertices: NDArray[np.float64], faces: NDArray[np.int64], size: int = 1024) -> NDArray[np.float64]:
-    """``(F, 3, 2)`` texture coordinates of the face corners, v downwards, in charts apart from each other."""
-    import xatlas
+    """``(F, 3, 2)`` texture coordinates of the face corners, v downwards, in charts apart from each other.
+
+    xatlas has no wheel for every system; without it, which is told, each two faces are a chart (`cell_atlas`).
+    """
+    try:
+        import xatlas
+    except ImportError:
+        _log.warning(
+            "xatlas is not installed (some systems have no wheel): each two faces of the mesh have a piece of the "
+            "texture of their own, which is hard to paint on. Install it, and run `tracking3d model`."
+        )
+        return cell_atlas(len(faces))[0]
 
     atlas = xatlas.Atlas()
     atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))

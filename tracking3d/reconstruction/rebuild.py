@@ -33,7 +33,7 @@ from tracking3d.video.source import FrameSource
 EXTENDS = "extends"
 """Key in ``run.json`` of the run whose frames made the mesh, too."""
 _TEXTURE_VIEWS = 24
-_NEEDED = ("skimage", "xatlas", "fast_simplification")
+_NEEDED = ("skimage", "fast_simplification")
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +224,8 @@ def check_packages() -> None:
     """
     if not has_packages():
         raise InputError(
-            "A new shape needs scikit-image, fast-simplification and xatlas, and one of them is missing: install them "
-            "by pip, or leave the mesh as it is."
+            "A new shape needs scikit-image and fast-simplification, and one of them is missing: install them by pip, "
+            "or leave the mesh as it is."
         )
 
 

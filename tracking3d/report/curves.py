@@ -18,22 +18,15 @@ MOST_POINTS = 2000
 
 @dataclass(frozen=True)
 class Curve:
-    """One figure over the frames.
+    """One figure over the frames."""
 
-    Attributes:
-        title: What it is.
-        path: The curve as the ``d`` of an SVG path; it has gaps where there is no value. Values that stand alone
-            are short dashes.
-        low: The figure at the lower edge, with its unit.
-        high: That at the upper edge.
-        summary: The curve in words, for who does not see it.
-    """
-
-    title: str
+    title: str  # what it is
+    # The curve as the d of an SVG path; it has gaps where there is no value. Values that stand alone are short
+    # dashes.
     path: str
-    low: str
-    high: str
-    summary: str
+    low: str  # the figure at the lower edge, with its unit
+    high: str  # that at the upper edge
+    summary: str  # the curve in words, for who does not see it
 
 
 def curve(
@@ -102,17 +95,11 @@ def across(position: int, count: int) -> float:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames in a row that share a status.
+    """Frames in a row that share a status."""
 
-    Attributes:
-        status: What they share.
-        x: Left edge in the picture.
-        width: Width there.
-    """
-
-    status: str
-    x: float
-    width: float
+    status: str  # what they share
+    x: float  # left edge in the picture
+    width: float  # width there
 
 
 def stretches(statuses: Sequence[str]) -> list[Stretch]:

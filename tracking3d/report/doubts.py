@@ -27,15 +27,10 @@ _BETTER_TRACKERS = {"csrt": "segment", "flow": "segment"}
 
 @dataclass(frozen=True)
 class Advice:
-    """Something to do next.
+    """Something to do next."""
 
-    Attributes:
-        what: A sentence.
-        commands: The command lines for it; capital words in them are to be filled in.
-    """
-
-    what: str
-    commands: tuple[str, ...]
+    what: str  # a sentence
+    commands: tuple[str, ...]  # the command lines for it; capital words in them are to be filled in
 
 
 def outcome_of(run: RunReader) -> tuple[str, str]:

@@ -68,23 +68,14 @@ def angles_between(R_a: NDArray[np.float64], R_b: NDArray[np.float64]) -> NDArra
 
 @dataclass(frozen=True)
 class StageShare:
-    """What one stage took of a run.
+    """What one stage took of a run."""
 
-    Attributes:
-        name: The stage.
-        what: In words.
-        seconds: Frame by frame, over the whole run.
-        again: In the final refinement.
-        share: Share of the longest stage, in percent: frame by frame.
-        share_again: The same of the refinement.
-    """
-
-    name: str
-    what: str
-    seconds: float
-    again: float
-    share: float
-    share_again: float
+    name: str  # the stage
+    what: str  # in words
+    seconds: float  # frame by frame, over the whole run
+    again: float  # in the final refinement
+    share: float  # share of the longest stage, in percent: frame by frame
+    share_again: float  # the same of the refinement
 
 
 def stage_shares(run: RunReader) -> list[StageShare]:

@@ -29,19 +29,13 @@ _BYTES_A_PIXEL = 0.15  # of a JPEG of that quality, as a first guess
 
 @dataclass(frozen=True, eq=False)
 class FramePictures:
-    """Pictures of some frames of a run.
+    """Pictures of some frames of a run."""
 
-    Attributes:
-        positions: Which of the run's estimates each picture shows, rising: positions in ``RunReader.frames``.
-        jpegs: The pictures.
-        width: Pixels across.
-        height: Pixels down.
-    """
-
+    # which of the run's estimates each picture shows, rising: positions in RunReader.frames
     positions: tuple[int, ...] = ()
-    jpegs: tuple[bytes, ...] = ()
-    width: int = 0
-    height: int = 0
+    jpegs: tuple[bytes, ...] = ()  # the pictures
+    width: int = 0  # pixels across
+    height: int = 0  # pixels down
 
     @property
     def step(self) -> int:

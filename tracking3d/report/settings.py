@@ -12,17 +12,13 @@ from tracking3d.config.loading import load_config
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
+    """One setting."""
 
-    Attributes:
-        name: With its section, such as ``solver.local_window``.
-        value: As text.
-        usual: The value of preset ``default``, if that is another one; None if it is the same or unknown.
-    """
-
-    name: str
-    value: str
-    usual: str | None
+    name: str  # with its section, such as solver.local_window
+    value: str  # as text
+    usual: (
+        str | None
+    )  # the value of preset default, if that is another one; None if it is the same or unknown
 
 
 def settings_of(config: Mapping[str, Any]) -> list[Setting]:

@@ -94,17 +94,11 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StartOfModel:
-    """Where the model that is refined started.
+    """Where the model that is refined started."""
 
-    Attributes:
-        frame: Index of the frame.
-        reason: Why it started there, in words.
-        advice: Of photos, which could not be joined, and what to do about that; empty if all were.
-    """
-
-    frame: int
-    reason: str
-    advice: str = ""
+    frame: int  # index of the frame
+    reason: str  # why it started there, in words
+    advice: str = ""  # of photos: which could not be joined, and what to do; empty if all were
 
 
 def refinement(

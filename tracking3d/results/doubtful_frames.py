@@ -16,23 +16,15 @@ _FIGURES = re.compile(r"[\d.]+")
 
 @dataclass(frozen=True)
 class DoubtfulRange:
-    """Frames in a row that are all uncertain, or all lost.
+    """Frames in a row that are all uncertain, or all lost."""
 
-    Attributes:
-        position: Position of the first frame among the estimates.
-        first: Its index in the source.
-        last: Index of the last frame.
-        count: Number of frames.
-        status: What they share.
-        reason: Why; several reasons with the number of frames of each, the commonest first. Figures in a reason are
-            those of its first frame.
-    """
-
-    position: int
-    first: int
-    last: int
-    count: int
-    status: Status
+    position: int  # position of the first frame among the estimates
+    first: int  # its index in the source
+    last: int  # index of the last frame
+    count: int  # number of frames
+    status: Status  # what they share
+    # Why; several reasons with the number of frames of each, the commonest first. Figures in a reason are those of
+    # its first frame.
     reason: str
 
     @property

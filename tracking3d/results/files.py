@@ -146,17 +146,11 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
 
 @dataclass(frozen=True)
 class PackedMask:
-    """A mask image that was decoded, as bits.
+    """A mask image that was decoded, as bits."""
 
-    Attributes:
-        shape: ``(H, W)``.
-        mask: The pixels from 128 on, see `unpack`.
-        occluder: The pixels of `OCCLUDER`; None if there are none.
-    """
-
-    shape: tuple[int, int]
-    mask: bytes
-    occluder: bytes | None
+    shape: tuple[int, int]  # (H, W)
+    mask: bytes  # the pixels from 128 on, see `unpack`
+    occluder: bytes | None  # the pixels of `OCCLUDER`; None if there are none
 
 
 def read_packed_mask(path: Path) -> PackedMask | None:

@@ -16,17 +16,11 @@ from tracking3d.results.records import FrameRecord
 
 @dataclass(frozen=True)
 class WrittenSoFar:
-    """What a stopped run has written.
+    """What a stopped run has written."""
 
-    Attributes:
-        lines: Bytes of ``frames.jsonl`` that are of finished frames.
-        seconds: Wall time of the run until then.
-        skipped: Frames that were not taken.
-    """
-
-    lines: int = 0
-    seconds: float = 0.0
-    skipped: tuple[SkippedFrame, ...] = ()
+    lines: int = 0  # bytes of frames.jsonl that are of finished frames
+    seconds: float = 0.0  # wall time of the run until then
+    skipped: tuple[SkippedFrame, ...] = ()  # frames that were not taken
 
 
 class FrameLines:

@@ -26,19 +26,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ImagePoints:
-    """N points that started outside the mesh, in the T frames of a run.
+    """N points that started outside the mesh, in the T frames of a run."""
 
-    Attributes:
-        followed: Positions in pixels of the frames; points in space of those that are tied to the surface.
-        tied: ``(N,)`` bool: which were found to lie on the surface in some frame.
-        face: ``(N,)`` face of the scene's mesh that they lie on there; -1 for points that never were.
-        barycentric: ``(N, 3)`` weights of its corners; NaN for points that never were.
-    """
-
-    followed: Followed
-    tied: NDArray[np.bool_]
-    face: NDArray[np.int64]
-    barycentric: Array
+    followed: (
+        Followed  # positions in pixels of the frames; points in space of those that are tied to the surface
+    )
+    tied: NDArray[np.bool_]  # (N,) bool: which were found to lie on the surface in some frame
+    face: NDArray[
+        np.int64
+    ]  # (N,) face of the scene's mesh that they lie on there; -1 for points that never were
+    barycentric: Array  # (N, 3) weights of its corners; NaN for points that never were
 
 
 def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:

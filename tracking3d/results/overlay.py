@@ -29,21 +29,13 @@ _AXIS_COLOURS: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 
 
 @dataclass(frozen=True)
 class OverlaySize:
-    """Layout of the overlay of one camera.
+    """Layout of the overlay of one camera."""
 
-    Attributes:
-        scale: Overlay pixels per frame pixel.
-        width: Width of picture and bar, even.
-        picture: Height of the picture.
-        bar: Height of the status bar below it; the sum is even.
-        line: Height of one line of text in the bar: the first has the figures, those below it the reason.
-    """
-
-    scale: float
-    width: int
-    picture: int
-    bar: int
-    line: int
+    scale: float  # overlay pixels per frame pixel
+    width: int  # width of picture and bar, even
+    picture: int  # height of the picture
+    bar: int  # height of the status bar below it; the sum is even
+    line: int  # height of one line of text in the bar: the first has the figures, those below it the reason
 
     @classmethod
     def of(cls, camera: Camera) -> OverlaySize:
@@ -63,15 +55,10 @@ class OverlaySize:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAxes:
-    """Position of the axes, in object coordinates.
+    """Position of the axes, in object coordinates."""
 
-    Attributes:
-        origin: ``(3,)``.
-        length: About the object's radius.
-    """
-
-    origin: NDArray[np.float64]
-    length: float
+    origin: NDArray[np.float64]  # (3,)
+    length: float  # about the object's radius
 
     @classmethod
     def of(cls, estimate: FrameEstimate, camera: Camera) -> ObjectAxes | None:

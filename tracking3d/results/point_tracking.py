@@ -48,17 +48,12 @@ _VERSION = 1  # of the saved file; another one is computed again
 
 @dataclass(frozen=True, eq=False)
 class RunScene:
-    """A run with the views of its frames.
+    """A run with the views of its frames."""
 
-    Attributes:
-        run: The run.
-        scene: Its surface in the frames, in their order.
-        pictures: Reads the whole frames, in the same order, for points that the surface does not cover; None if
-            such points are not followed.
-    """
-
-    run: RunReader
-    scene: LandmarkScene
+    run: RunReader  # the run
+    scene: LandmarkScene  # its surface in the frames, in their order
+    # reads the whole frames, in the same order, for points that the surface does not cover; None if such points are
+    # not followed
     pictures: Callable[[], list[Picture | None]] | None = None
 
     def track(self, frame: int, xy: ArrayLike, beside_object: bool = False) -> PointTracks:

@@ -37,19 +37,12 @@ _SIZE = argument("object_size=", "--object-size")
 
 @dataclass(frozen=True)
 class RunScale:
-    """What ``run.json`` says of the unit of a run in metres.
+    """What ``run.json`` says of the unit of a run in metres."""
 
-    Attributes:
-        object_size: Metres of the object's longest side.
-        scale: Metres per unit that the run was estimated in, of the final estimates and mesh.
-        causal_scale: The same of the causal ones, whose mesh is another one.
-        own_lines: Bytes of ``frames.jsonl`` in the run's own unit.
-    """
-
-    object_size: float
-    scale: float
-    causal_scale: float
-    own_lines: int
+    object_size: float  # metres of the object's longest side
+    scale: float  # metres per unit that the run was estimated in, of the final estimates and mesh
+    causal_scale: float  # the same of the causal ones, whose mesh is another one
+    own_lines: int  # bytes of frames.jsonl in the run's own unit
 
 
 def metres_per_unit(model: ObjectModel, object_size: float) -> float:

@@ -31,19 +31,12 @@ class ArrayTooLargeError(ArrayFileError):
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """What an array says of itself.
+    """What an array says of itself."""
 
-    Attributes:
-        shape: Its shape.
-        columns_first: Whether it is stored in Fortran's order.
-        dtype: Its type: numbers, bool or texts.
-        offset: Bytes before its values.
-    """
-
-    shape: tuple[int, ...]
-    columns_first: bool
-    dtype: np.dtype[Any]
-    offset: int
+    shape: tuple[int, ...]  # its shape
+    columns_first: bool  # whether it is stored in Fortran's order
+    dtype: np.dtype[Any]  # its type: numbers, bool or texts
+    offset: int  # bytes before its values
 
     @property
     def nbytes(self) -> int:

@@ -26,17 +26,11 @@ _MAX_BATCH = 10  # items that are processed at a time
 
 @dataclass(frozen=True, eq=False)
 class AttemptOutcome(Generic[State, Item, Result]):
-    """What came of an attempt.
+    """What came of an attempt."""
 
-    Attributes:
-        state: The state after it.
-        results: Of the items that were processed, in order; empty if the attempt found nothing.
-        left: The items that arrived since.
-    """
-
-    state: State
-    results: list[Result]
-    left: list[Item]
+    state: State  # the state after it
+    results: list[Result]  # of the items that were processed, in order; empty if the attempt found nothing
+    left: list[Item]  # the items that arrived since
 
 
 class BackgroundAttempt(Generic[State, Item, Result]):

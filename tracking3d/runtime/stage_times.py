@@ -16,22 +16,14 @@ from dataclasses import astuple, dataclass, fields, replace
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Seconds of wall time by stage.
+    """Seconds of wall time by stage."""
 
-    Attributes:
-        decode: Reading the frame; its share, if several objects are tracked.
-        track: The mask tracker, corrections included.
-        encode: The feature encoder.
-        solve: The pose, and whatever belongs to no other stage.
-        map: Learning shape and texture from keyframes.
-        write: Masks of the run folder, and the picture of the frame before: that is drawn when its estimate is safe.
-    """
-
-    decode: float = 0.0
-    track: float = 0.0
-    encode: float = 0.0
-    solve: float = 0.0
-    map: float = 0.0
+    decode: float = 0.0  # reading the frame; its share, if several objects are tracked
+    track: float = 0.0  # the mask tracker, corrections included
+    encode: float = 0.0  # the feature encoder
+    solve: float = 0.0  # the pose, and whatever belongs to no other stage
+    map: float = 0.0  # learning shape and texture from keyframes
+    # masks of the run folder, and the picture of the frame before: that is drawn when its estimate is safe
     write: float = 0.0
 
     @property

@@ -25,25 +25,17 @@ _MOST_AT_ONCE = 2**26
 
 @dataclass(eq=False)
 class FollowedRun:
-    """One object's run folder, read again as far as it has grown.
+    """One object's run folder, read again as far as it has grown."""
 
-    Attributes:
-        folder: The run folder.
-        name: What the viewer calls it.
-        frames: The final estimates by frame index, in order.
-        causal: Those from before the final refinement.
-        model: The object, once the run has written it.
-        description: What ``run.json`` says.
-        reader: Gives the masks and the camera.
-    """
-
-    folder: Path
-    name: str
-    description: dict[str, Any] = field(default_factory=dict)
-    frames: dict[int, FrameRecord] = field(default_factory=dict)
-    causal: dict[int, FrameRecord] = field(default_factory=dict)
-    model: ObjectModel | None = None
-    reader: RunReader = field(init=False)
+    folder: Path  # the run folder
+    name: str  # what the viewer calls it
+    description: dict[str, Any] = field(default_factory=dict)  # what run.json says
+    frames: dict[int, FrameRecord] = field(
+        default_factory=dict
+    )  # the final estimates by frame index, in order
+    causal: dict[int, FrameRecord] = field(default_factory=dict)  # those from before the final refinement
+    model: ObjectModel | None = None  # the object, once the run has written it
+    reader: RunReader = field(init=False)  # gives the masks and the camera
 
     def __post_init__(self) -> None:
         self._lines: list[FrameRecord] = []

@@ -29,17 +29,11 @@ _UNLIKELY = 0.02  # probability up to which a pixel is left as it is
 
 @dataclass(frozen=True)
 class Shown:
-    """What is drawn into the picture.
+    """What is drawn into the picture."""
 
-    Attributes:
-        layers: Names of those of `LAYERS`.
-        axes: Whether the object's axes are.
-        probability: Whether the object's probability is, if it was kept.
-    """
-
-    layers: frozenset[str] = frozenset({"refined"})
-    axes: bool = True
-    probability: bool = False
+    layers: frozenset[str] = frozenset({"refined"})  # names of those of `LAYERS`
+    axes: bool = True  # whether the object's axes are
+    probability: bool = False  # whether the object's probability is, if it was kept
 
 
 def draw_picture(

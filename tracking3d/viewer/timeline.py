@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import groupby, pairwise
 
 from tracking3d.results import drawing
 from tracking3d.results.drawing import Colour
@@ -106,27 +107,18 @@ def _clickable(drawn: str, first: int, last: int) -> str:
 
 def _strip(run: FollowedRun, number: int, first: int, span: int) -> str:
     """The status of every frame as runs of colour, the keyframes as marks on it."""
-    top, parts = number * _STRIP, []
-    step = 1000 / span
-    begin: FrameRecord | None = None
-    before: FrameRecord | None = None
-    for record in [*run.frames.values(), None]:
-        joined = (
-            record is not None
-            and before is not None
-            and (record.status, record.index) == (before.status, before.index + 1)
-        )
-        if begin is not None and before is not None and not joined:
-            x, width = (begin.index - first - 0.5) * step, (before.index - begin.index + 1) * step
-            parts.append(
-                f'<rect x="{x:.1f}" y="{top}" width="{max(width, 1.5):.1f}" height="{_STRIP - 2}" '
-                f'fill="{hexadecimal(drawing.STATUS[begin.status])}"/>'
-            )
-        begin = begin if joined else record
-        before = record
-    keyframes = [record.index for record in run.frames.values() if record.keyframe]
+    top, step, records = number * _STRIP, 1000 / span, list(run.frames.values())
+    place = f'y="{top}" height="{_STRIP - 2}"'
+    groups = [list(alike) for _, alike in groupby(records, key=lambda record: record.status)]
+    begins = [alike[0].index for alike in groups] + [record.index + 1 for record in records[-1:]]
+    parts = [
+        f'<rect x="{(begin - first - 0.5) * step:.1f}" width="{max((end - begin) * step, 1.5):.1f}" {place} '
+        f'fill="{hexadecimal(drawing.STATUS[alike[0].status])}"/>'
+        for alike, (begin, end) in zip(groups, pairwise(begins), strict=True)
+    ]
+    keyframes = [record.index for record in records if record.keyframe]
     parts += [
-        f'<rect x="{(index - first) * step - 1:.1f}" y="{top}" width="2" height="{_STRIP - 2}" fill="#222"/>'
+        f'<rect x="{(index - first) * step - 1:.1f}" width="2" {place} fill="#222"/>'
         for index in keyframes[:: max(len(keyframes) // _COLUMNS, 1)]
     ]
     return "".join(parts)

@@ -43,17 +43,11 @@ _USUAL_RATE = 10.0  # frames a second if the source has no rate
 
 @dataclass(eq=False)
 class Video:
-    """One RUN of the command line: a video, and its objects.
+    """One RUN of the command line: a video, and its objects."""
 
-    Attributes:
-        name: What the viewer calls it.
-        runs: The objects.
-        images: Gives the frames; None if they are not at hand.
-    """
-
-    name: str
-    runs: list[FollowedRun]
-    images: FrameImages | None
+    name: str  # what the viewer calls it
+    runs: list[FollowedRun]  # the objects
+    images: FrameImages | None  # gives the frames; None if they are not at hand
     axes: list[ObjectAxes | None] = field(default_factory=list)
 
 

@@ -189,19 +189,9 @@ class _Announcer(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         kept = "the result is kept" if self._folder else "no folder can be written to keep the result in"
-        announce_compilation(kept)
+        if not _announced.is_set():
+            _log.warning("Compiling kernels for this processor takes some seconds; %s.", kept)
+        _announced.set()
 
     def on_end(self, event: event.Event) -> None:
         pass
-
-
-def announce_compilation(outcome: str, quiet: bool = False) -> None:
-    """Say that kernels are compiled, once in a process.
-
-    Args:
-        outcome: What becomes of them, in words.
-        quiet: Say nothing, now and later.
-    """
-    if not _announced.is_set() and not quiet:
-        _log.warning("Compiling kernels for this processor takes some seconds; %s.", outcome)
-    _announced.set()
