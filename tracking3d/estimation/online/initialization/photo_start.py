@@ -74,6 +74,8 @@ _LINK_POINTS, _LINK_SHARE = (
     8,
     0.65,
 )  # points that two photos share at least, and the share that fits if they agree
+_CLEAR_SHARE = 0.8  # share of the observations from which no other pose of a photo is tried (chosen)
+_ENOUGH_JOINED = 0.9  # share of the photos from which no other start is tried (chosen)
 _ROUNDS = 3
 _AGAIN = 1.3  # times as many points for another attempt
 _LEAST_ANGLE = 2.0  # degrees between the rays of a point
@@ -225,6 +227,8 @@ def add_photo(tracks: PhotoTracks, found: PhotoStructure, photo: int) -> PhotoSt
         linked = _links(tracks, added)
         if count >= most and linked[np.ix_(linked[photo], linked[photo])].any():
             best, most = added, count
+            if count >= _CLEAR_SHARE * np.count_nonzero(common):
+                break
     return best
 
 
@@ -375,6 +379,8 @@ def solve_photos(tracks: PhotoTracks, cameras: Sequence[FloatArray]) -> list[Pho
                 break
         if math.isfinite(one.cost):
             grown.append(one)
+        if len(one.photos) >= _ENOUGH_JOINED * len(tracks.visible):
+            break
     return sorted(grown, key=lambda one: (-len(one.photos), -one.support))
 
 
