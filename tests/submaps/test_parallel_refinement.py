@@ -39,7 +39,7 @@ def frames(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clip")
     for name in ("frames", "masks"):
         (folder / name).mkdir()
-    for index, (image, mask) in enumerate(zip(clip.images, degrade_masks(clip.masks, 0), strict=True)):
+    for index, (image, mask) in enumerate(zip(clip.images, degrade_masks(clip.masks, 0, 3.0), strict=True)):
         write_image(folder / "frames" / f"{index:03d}.png", image)
         write_mask(folder / "masks" / f"{index:03d}.png", mask)
     return folder / "frames"

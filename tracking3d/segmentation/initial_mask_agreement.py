@@ -18,8 +18,9 @@ from tracking3d.segmentation.colour_models import near_outlines, relative_distan
 from tracking3d.segmentation.frame_window import FrameWindow
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 
-KEEP_WEIGHT = 0.9
-"""Weight from which an initial mask is kept as it is."""
+_FADING = 0.15
+"""Weight that an initial mask lacks, up to which its outline is smoothed in proportion; chosen. At full weight it is
+kept as it is. Processors differ by .036 in the weight of a run."""
 _MOST_FRAMES = 24
 """Frames in which the hull is compared, spread over those that it was made from."""
 _BEYOND, _APART = (0.008, 0.013), (0.016, 0.022)
@@ -90,6 +91,11 @@ class InitialMaskAgreement:
             # A side that few frames show has its outline in the narrow one only.
             apart.append(float(np.median(np.abs(difference))))
         return beyond, min(apart)
+
+
+def smoothing_of(weight: float) -> float:
+    """How far the outline of an initial mask of that weight is smoothed along the image's edges, in [0, 1]."""
+    return min((1 - weight) / _FADING, 1.0)
 
 
 def _falling(value: float, limits: tuple[float, float]) -> float:

@@ -20,7 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
-from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT, InitialMaskAgreement
+from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement, smoothing_of
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
@@ -168,7 +168,7 @@ class VideoSegmenter:
         if not pose_weight(frame.confidence):
             return frame.index, None
         initial_weight = self._initial_weight(frame)
-        if initial_weight >= KEEP_WEIGHT:
+        if initial_weight == 1:
             return frame.index, SegmentedMask(
                 frame.index, frame.initial, frame.initial.astype(np.float32), is_initial=True
             )
@@ -181,7 +181,7 @@ class VideoSegmenter:
         if scene.occluder is not None and (behind := said.shape) is not None:
             odds = np.where(scene.occluder, shape_log_odds(behind), odds)
         odds = blend_with_initial(odds, scene.initial, weight)
-        support = clean_mask(snap_to_edges(scene.image, odds, _ASKED))
+        support = clean_mask(snap_to_edges(scene.image, odds, smoothing_of(initial_weight) * _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
         mask = full > 0

@@ -23,7 +23,7 @@ from tracking3d.segmentation import (
     pose_weight,
     snap_to_edges,
 )
-from tracking3d.segmentation.initial_mask_agreement import KEEP_WEIGHT
+from tracking3d.segmentation.initial_mask_agreement import smoothing_of
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
 
@@ -74,7 +74,7 @@ def fuse_mask(
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
-    if initial_weight >= KEEP_WEIGHT:
+    if initial_weight == 1:
         return FusedMask(initial, MaskSource.INITIAL)
     window, image = upsampled_window(observation)
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
@@ -83,7 +83,7 @@ def fuse_mask(
     told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
-    odds = blend_with_initial(odds, own, 1 - initial_weight)
+    odds, asked = blend_with_initial(odds, own, 1 - initial_weight), smoothing_of(initial_weight) * asked
     support = _extract(image, odds, asked, initial, window)
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
     if not share:  # nothing but the silhouette speaks against the initial mask
