@@ -26,21 +26,13 @@ from tracking3d.video.image_sequence import images_among
 
 @dataclass(frozen=True)
 class MeasuredEncoder:
-    """One encoder's result.
+    """One encoder's result."""
 
-    Attributes:
-        channels: Channels of its features.
-        stride: Input pixels per feature pixel.
-        milliseconds: Median time of one image.
-        scores: With all channels.
-        reduced: With the reduced number of channels, if that was requested.
-    """
-
-    channels: int
-    stride: int
-    milliseconds: float
-    scores: MatchingScores
-    reduced: MatchingScores | None
+    channels: int  # channels of its features
+    stride: int  # input pixels per feature pixel
+    milliseconds: float  # median time of one image
+    scores: MatchingScores  # with all channels
+    reduced: MatchingScores | None  # with the reduced number of channels, if that was requested
 
 
 def parse_encoder(text: str) -> tuple[str, PluginChoice]:

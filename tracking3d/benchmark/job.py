@@ -48,21 +48,13 @@ MEMORY = "memory.json"
 
 @dataclass(frozen=True)
 class Job:
-    """A sequence and how to run it.
+    """A sequence and how to run it."""
 
-    Attributes:
-        layout: Name of a dataset's layout, or the YAML file of one.
-        root: Folder of the dataset.
-        sequence: The sequence's name.
-        variant: How to run it.
-        out: The folder for everything of this benchmark.
-    """
-
-    layout: str
-    root: Path
-    sequence: str
-    variant: Variant
-    out: Path
+    layout: str  # name of a dataset's layout, or the YAML file of one
+    root: Path  # folder of the dataset
+    sequence: str  # the sequence's name
+    variant: Variant  # how to run it
+    out: Path  # the folder for everything of this benchmark
 
     @cached_property
     def truth(self) -> Truth:

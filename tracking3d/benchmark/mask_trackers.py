@@ -49,15 +49,10 @@ FLOW_CUES: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class Contestant:
-    """A mask tracker and what tables call it.
+    """A mask tracker and what tables call it."""
 
-    Attributes:
-        label: Its name in tables.
-        choice: The plug-in and its options.
-    """
-
-    label: str
-    choice: PluginChoice
+    label: str  # its name in tables
+    choice: PluginChoice  # the plug-in and its options
 
     @classmethod
     def of(cls, choice: PluginChoice) -> Self:
@@ -67,38 +62,24 @@ class Contestant:
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """One frame after the first that has a true mask or box.
+    """One frame after the first that has a true mask or box."""
 
-    Attributes:
-        index: Its index in the sequence.
-        iou: IoU of the tracker's mask and the true one; no mask is an empty one.
-        boundary_f: Boundary F of the same; NaN if only a box is known.
-        score: The tracker's own.
-    """
-
-    index: int
-    iou: float
-    boundary_f: float
-    score: float
+    index: int  # its index in the sequence
+    iou: float  # IoU of the tracker's mask and the true one; no mask is an empty one
+    boundary_f: float  # boundary F of the same; NaN if only a box is known
+    score: float  # the tracker's own
 
 
 @dataclass(frozen=True)
 class TrackerMeasurement:
-    """One tracker on one sequence, or on several together.
+    """One tracker on one sequence, or on several together."""
 
-    Attributes:
-        tracker: The contestant's label.
-        sequence: The sequence's name.
-        frames: Every frame that was scored.
-        seconds: Wall time of every step, scored or not; the first frame is not among them.
-        error: Why it failed, or empty.
-    """
-
-    tracker: str
-    sequence: str
-    frames: tuple[TrackedFrame, ...] = ()
+    tracker: str  # the contestant's label
+    sequence: str  # the sequence's name
+    frames: tuple[TrackedFrame, ...] = ()  # every frame that was scored
+    # wall time of every step, scored or not; the first frame is not among them
     seconds: tuple[float, ...] = ()
-    error: str = ""
+    error: str = ""  # why it failed, or empty
 
     def figures(self) -> dict[str, float | int | None]:
         """The measures by name; None if there is nothing to measure.

@@ -45,34 +45,21 @@ _GAMMA, _SHADING, _CAST, _NOISE = 1.4, 0.5, 0.15, 0.02
 
 @dataclass(frozen=True, eq=False)
 class MatchingPair:
-    """An image and what a homography and another light make of it.
+    """An image and what a homography and another light make of it."""
 
-    Attributes:
-        image: ``(3, S, S)`` RGB in [0, 1].
-        warped: ``(3, S, S)`` RGB in [0, 1].
-        points: ``(N, 2)`` x and y of textured pixels of ``image``, whole numbers.
-        truth: ``(N, 2)`` their positions in ``warped``, in pixels.
-    """
-
-    image: Tensor
-    warped: Tensor
-    points: Tensor
-    truth: Tensor
+    image: Tensor  # (3, S, S) RGB in [0, 1]
+    warped: Tensor  # (3, S, S) RGB in [0, 1]
+    points: Tensor  # (N, 2) x and y of textured pixels of image, whole numbers
+    truth: Tensor  # (N, 2) their positions in warped, in pixels
 
 
 @dataclass(frozen=True)
 class MatchingScores:
-    """Shares of points whose nearest neighbour lies within `TOLERANCE` of the truth.
+    """Shares of points whose nearest neighbour lies within `TOLERANCE` of the truth."""
 
-    Attributes:
-        everywhere: Searched over the whole warped image.
-        nearby: Share if searched within `RADIUS` of the truth.
-        points: How many points were searched for.
-    """
-
-    everywhere: float
-    nearby: float
-    points: int
+    everywhere: float  # searched over the whole warped image
+    nearby: float  # share if searched within `RADIUS` of the truth
+    points: int  # how many points were searched for
 
 
 def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[MatchingPair]:

@@ -16,14 +16,10 @@ class NoisyFrames:
     """The frames of a source, each value one grey level higher, lower or as it was.
 
     See `tracking3d.video.source.FrameSource` for the attributes that are not named here.
-
-    Attributes:
-        source: The frames as they are.
-        seed: Seed of the noise; every frame has its own, the same whenever it is read.
     """
 
-    source: FrameSource
-    seed: int
+    source: FrameSource  # the frames as they are
+    seed: int  # seed of the noise; every frame has its own, the same whenever it is read
 
     @property
     def name(self) -> str:

@@ -10,15 +10,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Published:
-    """One row of a table in the paper.
+    """One row of a table in the paper."""
 
-    Attributes:
-        value: IoU, or average recall in Table 5.
-        gain: Gain over the initial masks, in percent, if printed.
-    """
-
-    value: float
-    gain: float | None = None
+    value: float  # IoU, or average recall in Table 5
+    gain: float | None = None  # gain over the initial masks, in percent, if printed
 
 
 CDTB = {

@@ -45,42 +45,25 @@ class PointRow:
 
 @dataclass(frozen=True, eq=False)
 class PointErrors:
-    """Points of one run in all frames after their query in which they are truly visible and have a position.
+    """Points of one run in all frames after their query in which they are truly visible and have a position."""
 
-    Attributes:
-        error: ``(M,)`` pixels of the frame.
-        uncertainty: ``(M,)``.
-        measured: ``(M,)`` bool.
-        features: ``(M, F)``, see `tracking3d.points.uncertainty.error_features`.
-    """
-
-    error: NDArray[np.float64]
-    uncertainty: NDArray[np.float64]
-    measured: NDArray[np.bool_]
-    features: NDArray[np.float64]
+    error: NDArray[np.float64]  # (M,) pixels of the frame
+    uncertainty: NDArray[np.float64]  # (M,)
+    measured: NDArray[np.bool_]  # (M,) bool
+    features: NDArray[np.float64]  # (M, F), see `tracking3d.points.uncertainty.error_features`
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRun:
-    """What came of one run.
+    """What came of one run."""
 
-    Attributes:
-        sequence: Its sequence.
-        masks: The source of its initial masks.
-        refined: Whether its refined estimates were taken.
-        rows: By method.
-        inside: Share of the errors inside twice the uncertainty.
-        errors: Errors of the corrected points.
-        seconds_landmarks: For opening the frames and finding landmarks, once a run.
-    """
-
-    sequence: str
-    masks: str
-    refined: bool
-    rows: dict[str, PointRow]
-    inside: float | None
-    errors: PointErrors
-    seconds_landmarks: float
+    sequence: str  # its sequence
+    masks: str  # the source of its initial masks
+    refined: bool  # whether its refined estimates were taken
+    rows: dict[str, PointRow]  # by method
+    inside: float | None  # share of the errors inside twice the uncertainty
+    errors: PointErrors  # errors of the corrected points
+    seconds_landmarks: float  # for opening the frames and finding landmarks, once a run
 
 
 def finished_jobs(folder: Path) -> list[tuple[Job, Path]]:

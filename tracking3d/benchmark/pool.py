@@ -18,21 +18,13 @@ from tracking3d.errors import Tracking3dError
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """What became of a job.
+    """What became of a job."""
 
-    Attributes:
-        job: The job.
-        scores: Its scores by name; None if it failed.
-        error: Why it failed, in a sentence; empty if it did not.
-        cached: Whether an earlier process had done it.
-        seconds: Wall time.
-    """
-
-    job: Job
-    scores: dict[str, Any] | None
-    error: str = ""
-    cached: bool = False
-    seconds: float = 0.0
+    job: Job  # the job
+    scores: dict[str, Any] | None  # its scores by name; None if it failed
+    error: str = ""  # why it failed, in a sentence; empty if it did not
+    cached: bool = False  # whether an earlier process had done it
+    seconds: float = 0.0  # wall time
 
 
 Listener = Callable[[JobOutcome], None]

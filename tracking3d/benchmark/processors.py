@@ -38,15 +38,10 @@ _CORE = re.compile(r"^Core: *(\S+)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Kernels:
-    """What a process computes with.
+    """What a process computes with."""
 
-    Attributes:
-        openblas: The processor whose kernels NumPy's OpenBLAS takes; empty if NumPy has another library.
-        aten: The instructions whose kernels torch takes.
-    """
-
-    openblas: str
-    aten: str
+    openblas: str  # the processor whose kernels NumPy's OpenBLAS takes; empty if NumPy has another library
+    aten: str  # the instructions whose kernels torch takes
 
 
 def detect_kernels(environment: Mapping[str, str]) -> Kernels | None:

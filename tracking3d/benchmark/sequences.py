@@ -18,21 +18,13 @@ REAL = "real"
 
 @dataclass(frozen=True)
 class Dataset:
-    """Sequences to be run.
+    """Sequences to be run."""
 
-    Attributes:
-        name: What results call it.
-        version: Version of a synthetic suite; None for others.
-        layout: Name of the layout, or the YAML file of one.
-        root: Folder of the dataset.
-        sequences: Names of the sequences.
-    """
-
-    name: str
-    version: int | None
-    layout: str
-    root: Path
-    sequences: tuple[str, ...]
+    name: str  # what results call it
+    version: int | None  # version of a synthetic suite; None for others
+    layout: str  # name of the layout, or the YAML file of one
+    root: Path  # folder of the dataset
+    sequences: tuple[str, ...]  # names of the sequences
 
     @property
     def synthetic(self) -> bool:

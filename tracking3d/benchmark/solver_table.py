@@ -65,23 +65,14 @@ _NOTE = (
 
 @dataclass(frozen=True)
 class SideBySide:
-    """A filled table.
+    """A filled table."""
 
-    Attributes:
-        name: Its name.
-        caption: What it shows, on which data, with which settings.
-        columns: Their names.
-        sequences: Their names.
-        figures: By measure, column and sequence, if known.
-        notes: Why something is missing.
-    """
-
-    name: str
-    caption: str
-    columns: tuple[str, ...]
-    sequences: tuple[str, ...]
-    figures: Mapping[str, Mapping[str, Mapping[str, float]]]
-    notes: tuple[str, ...] = ()
+    name: str  # its name
+    caption: str  # what it shows, on which data, with which settings
+    columns: tuple[str, ...]  # their names
+    sequences: tuple[str, ...]  # their names
+    figures: Mapping[str, Mapping[str, Mapping[str, float]]]  # by measure, column and sequence, if known
+    notes: tuple[str, ...] = ()  # why something is missing
 
     def common(self, measure: str) -> list[str]:
         """The sequences for which every column has the figure."""

@@ -47,17 +47,11 @@ LOST_DEGREES = 20.0
 
 @dataclass(frozen=True)
 class Spread:
-    """One measure under all variants.
+    """One measure under all variants."""
 
-    Attributes:
-        sequence: The sequence; empty for the mean over all of them.
-        measure: Its name in the scores.
-        values: By label of the variant.
-    """
-
-    sequence: str
-    measure: str
-    values: dict[str, float]
+    sequence: str  # the sequence; empty for the mean over all of them
+    measure: str  # its name in the scores
+    values: dict[str, float]  # by label of the variant
 
     @property
     def mean(self) -> float:

@@ -39,46 +39,28 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Line:
-    """A filled row: the paper's figures and those measured here; None if there is none.
+    """A filled row: the paper's figures and those measured here; None if there is none."""
 
-    Attributes:
-        label: The row's name.
-        paper: The paper's measure.
-        paper_gain_percent: The paper's gain over the initial masks.
-        here: The same measure here.
-        gain_percent: Gain of the mean IoU over that of the initial masks here.
-        rotation_error_mean_deg: Mean rotation error, if the poses are known.
-        seconds_per_frame: Mean wall time.
-        sequences: Number of sequences that the figures here are the mean of.
-        improved: Number of those whose mean IoU is above that of their initial masks; None if none is compared.
-        note: Why something is missing.
-    """
-
-    label: str
-    paper: float | None = None
-    paper_gain_percent: float | None = None
-    here: float | None = None
-    gain_percent: float | None = None
-    rotation_error_mean_deg: float | None = None
-    seconds_per_frame: float | None = None
-    sequences: int = 0
+    label: str  # the row's name
+    paper: float | None = None  # the paper's measure
+    paper_gain_percent: float | None = None  # the paper's gain over the initial masks
+    here: float | None = None  # the same measure here
+    gain_percent: float | None = None  # gain of the mean IoU over that of the initial masks here
+    rotation_error_mean_deg: float | None = None  # mean rotation error, if the poses are known
+    seconds_per_frame: float | None = None  # mean wall time
+    sequences: int = 0  # number of sequences that the figures here are the mean of
+    # number of those whose mean IoU is above that of their initial masks; None if none is compared
     improved: int | None = None
-    note: str = ""
+    note: str = ""  # why something is missing
 
 
 @dataclass(frozen=True)
 class Filled:
-    """A table with both columns.
+    """A table with both columns."""
 
-    Attributes:
-        name: Its name.
-        caption: What it shows, on which data, with which settings.
-        lines: Its rows.
-    """
-
-    name: str
-    caption: str
-    lines: tuple[Line, ...]
+    name: str  # its name
+    caption: str  # what it shows, on which data, with which settings
+    lines: tuple[Line, ...]  # its rows
 
 
 def fill(

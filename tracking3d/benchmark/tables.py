@@ -27,49 +27,30 @@ DEEP = "s2dnet"
 
 @dataclass(frozen=True)
 class TableRow:
-    """One row of a table.
+    """One row of a table."""
 
-    Attributes:
-        label: Its name.
-        paper: What the paper prints there, if anything.
-        plan: Name of its run in the plan; empty if there are only the paper's figures.
-        initial: Whether it shows the initial masks of that run, not its estimates.
-    """
-
-    label: str
-    paper: Published | None = None
-    plan: str = ""
-    initial: bool = False
+    label: str  # its name
+    paper: Published | None = None  # what the paper prints there, if anything
+    plan: str = ""  # name of its run in the plan; empty if there are only the paper's figures
+    initial: bool = False  # whether it shows the initial masks of that run, not its estimates
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the paper and how to fill our column.
+    """A table of the paper and how to fill our column."""
 
-    Attributes:
-        name: Its name on the command line.
-        title: What it is.
-        source: Its place in the paper.
-        dataset: Layout of the real dataset.
-        rows: Its rows.
-        plan: What is run: from the settings to start with, whether the data are synthetic, and folders of initial
-            masks by tracker.
-        note: What a reader has to know to compare the columns.
-        measure: The measure in the columns.
-        sequences: Patterns of the synthetic sequences that are fit for it.
-        sample: So many sequences of the real dataset are drawn, with a fixed seed; 0 for all.
-    """
-
-    name: str
-    title: str
-    source: str
-    dataset: str
-    rows: tuple[TableRow, ...]
+    name: str  # its name on the command line
+    title: str  # what it is
+    source: str  # its place in the paper
+    dataset: str  # layout of the real dataset
+    rows: tuple[TableRow, ...]  # its rows
+    # what is run: from the settings to start with, whether the data are synthetic, and folders of initial masks by
+    # tracker
     plan: Callable[[Variant, bool, Mapping[str, Path]], Plan]
-    note: str = ""
-    measure: str = "iou_mean"
-    sequences: tuple[str, ...] = ()
-    sample: int = 0
+    note: str = ""  # what a reader has to know to compare the columns
+    measure: str = "iou_mean"  # the measure in the columns
+    sequences: tuple[str, ...] = ()  # patterns of the synthetic sequences that are fit for it
+    sample: int = 0  # so many sequences of the real dataset are drawn, with a fixed seed; 0 for all
 
     def only(self, patterns: Sequence[str]) -> Table:
         """The table with the rows that match any of the patterns, all if there is no pattern.

@@ -36,50 +36,31 @@ _WARM_UP = 2  # frames of a run before the measured ones: it compiles kernels, a
 
 @dataclass(frozen=True)
 class Contender:
-    """One way to track the clip.
+    """One way to track the clip."""
 
-    Attributes:
-        name: What it is called.
-        settings: Words for ``tracking3d run``.
-        frames: How many of the clip's it tracks; None for all.
-        package: The folder that holds its package; None for this version.
-    """
-
-    name: str
-    settings: tuple[str, ...] = ()
-    frames: int | None = None
-    package: Path | None = None
+    name: str  # what it is called
+    settings: tuple[str, ...] = ()  # words for tracking3d run
+    frames: int | None = None  # how many of the clip's it tracks; None for all
+    package: Path | None = None  # the folder that holds its package; None for this version
 
 
 @dataclass(frozen=True)
 class TrackSpeed:
-    """What one run took.
+    """What one run took."""
 
-    Attributes:
-        name: Name of the contender.
-        frames: Frames with a causal estimate.
-        wall: Seconds of the whole command, start of the process and imports included.
-        processor: Seconds of all processors for it; None if the system does not say.
-        first_answer: Seconds from the command to the first estimate: start of the process, imports, and that frame.
-        frames_per_second: Causal estimates a second of wall time, from the first to the last.
-        delays: Seconds from when a frame is asked for to when its estimate is written: percentiles as `PERCENTILES`.
-        stages: Mean seconds a frame.
-        refinement: Seconds a frame of the final refinement; None if there is none.
-        peak_memory: Megabytes.
-        over_time: ``(N, stages)`` seconds of every frame, in the order of `STAGES`.
-    """
-
-    name: str
-    frames: int
-    wall: float
-    processor: float | None
+    name: str  # name of the contender
+    frames: int  # frames with a causal estimate
+    wall: float  # seconds of the whole command, start of the process and imports included
+    processor: float | None  # seconds of all processors for it; None if the system does not say
+    # seconds from the command to the first estimate: start of the process, imports, and that frame
     first_answer: float
-    frames_per_second: float | None
+    frames_per_second: float | None  # causal estimates a second of wall time, from the first to the last
+    # seconds from when a frame is asked for to when its estimate is written: percentiles as `PERCENTILES`
     delays: tuple[float, ...]
-    stages: StageTimes
-    refinement: float | None
-    peak_memory: float | None
-    over_time: tuple[tuple[float, ...], ...]
+    stages: StageTimes  # mean seconds a frame
+    refinement: float | None  # seconds a frame of the final refinement; None if there is none
+    peak_memory: float | None  # megabytes
+    over_time: tuple[tuple[float, ...], ...]  # (N, stages) seconds of every frame, in the order of `STAGES`
 
 
 def measure(

@@ -15,24 +15,18 @@ DEGRADED, NOISE, HAND = "degraded:", "noise:", "hand"
 
 
 class Variant(BaseModel):
-    """One way to run every sequence.
-
-    Attributes:
-        label: What tables call it.
-        config: The pipeline; what the masks need is set when they are known.
-        masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder that
-            holds a folder of masks for every sequence.
-        environment: Environment variables of the process that runs it, such as which matrix kernels it uses.
-        input: Changes of the sequence's input.
-    """
+    """One way to run every sequence."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    label: str
-    config: PipelineConfig
+    label: str  # what tables call it
+    config: PipelineConfig  # the pipeline; what the masks need is set when they are known
+    # tracker, truth, initial, degraded:IOU, noise:PIXELS, hand, or a folder that holds a folder of masks for every
+    # sequence
     masks: str = "tracker"
+    # environment variables of the process that runs it, such as which matrix kernels it uses
     environment: dict[str, str] = {}
-    input: InputChange = InputChange()
+    input: InputChange = InputChange()  # changes of the sequence's input
 
     @field_validator("masks")
     @classmethod

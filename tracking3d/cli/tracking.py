@@ -33,9 +33,8 @@ class RunRequest:
     prompts: PromptSet  # the objects; none if the mask tracker or a known object replaces the prompt
     options: RecordOptions  # how the run is recorded, selection of the frames included
     corrections: Sequence[Correction] = ()  # prompts in later frames
-    skip_damaged: bool = (
-        False  # if the first frame cannot be decoded, apply the prompts to the first frame that can
-    )
+    # if the first frame cannot be decoded, apply the prompts to the first frame that can
+    skip_damaged: bool = False
     fps: float | None = None  # frame rate of a source that has no timestamps
 
 
@@ -47,9 +46,8 @@ class RunDisplay:
     report: bool = True  # write a report at the end
     view: bool = False  # show the run in the browser
     host: str | None = None  # address of this machine that the page is served on; this machine only if None
-    page: Picker | None = (
-        None  # the page on which the object was picked, which shows the run then; None without it
-    )
+    # the page on which the object was picked, which shows the run then; None without it
+    page: Picker | None = None
 
 
 def track(request: RunRequest, display: RunDisplay) -> None:

@@ -20,9 +20,8 @@ class SeenSurface:
     points: NDArray[np.float64]  # (V, 3) object coordinates in the unit of the export
     colours: NDArray[np.uint8]  # (V, 3) uint8 RGB
     pixels: NDArray[np.float64]  # (N, V, 2) where they are; (0, 0) is the centre of the top-left pixel
-    seen: NDArray[
-        np.bool_
-    ]  # (N, V) whether they are seen: in the frame, unhidden, and within the estimated mask
+    # (N, V) whether they are seen: in the frame, unhidden, and within the estimated mask
+    seen: NDArray[np.bool_]
 
 
 def find_seen_surface(run: ExportedRun) -> SeenSurface:

@@ -16,9 +16,8 @@ class Setting:
 
     name: str  # with its section, such as solver.local_window
     value: str  # as text
-    usual: (
-        str | None
-    )  # the value of preset default, if that is another one; None if it is the same or unknown
+    # the value of preset default, if that is another one; None if it is the same or unknown
+    usual: str | None
 
 
 def settings_of(config: Mapping[str, Any]) -> list[Setting]:

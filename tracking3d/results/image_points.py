@@ -28,13 +28,11 @@ Array = NDArray[np.float64]
 class ImagePoints:
     """N points that started outside the mesh, in the T frames of a run."""
 
-    followed: (
-        Followed  # positions in pixels of the frames; points in space of those that are tied to the surface
-    )
+    # positions in pixels of the frames; points in space of those that are tied to the surface
+    followed: Followed
     tied: NDArray[np.bool_]  # (N,) bool: which were found to lie on the surface in some frame
-    face: NDArray[
-        np.int64
-    ]  # (N,) face of the scene's mesh that they lie on there; -1 for points that never were
+    # (N,) face of the scene's mesh that they lie on there; -1 for points that never were
+    face: NDArray[np.int64]
     barycentric: Array  # (N, 3) weights of its corners; NaN for points that never were
 
 

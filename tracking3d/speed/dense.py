@@ -24,15 +24,10 @@ CHUNK = 200_000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PrecomputedRendering(Rendering):
-    """A rendering of another implementation, which gives everything at once.
+    """A rendering of another implementation, which gives everything at once."""
 
-    Attributes:
-        given_silhouette: The `silhouette`.
-        given_uv: The `uv`.
-    """
-
-    given_silhouette: Tensor
-    given_uv: Tensor
+    given_silhouette: Tensor  # the `silhouette`
+    given_uv: Tensor  # the `uv`
 
     @cached_property
     def silhouette(self) -> Tensor:

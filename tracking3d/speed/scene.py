@@ -27,21 +27,13 @@ def default_texture(channels: int) -> int:
 
 @dataclass(frozen=True)
 class RenderWorkload:
-    """How much there is to render.
+    """How much there is to render."""
 
-    Attributes:
-        size: Side of the windows in pixels.
-        frames: Frames in the batch.
-        channels: Channels of the texture and of the frames.
-        texture: Side of the texture in texels.
-        frequency: Frequency of the icosphere.
-    """
-
-    size: int = 128
-    frames: int = 7
-    channels: int = 3
-    texture: int = 300
-    frequency: int = 11
+    size: int = 128  # side of the windows in pixels
+    frames: int = 7  # frames in the batch
+    channels: int = 3  # channels of the texture and of the frames
+    texture: int = 300  # side of the texture in texels
+    frequency: int = 11  # frequency of the icosphere
 
     @property
     def pixels(self) -> int:
@@ -56,19 +48,12 @@ class RenderWorkload:
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """One problem: what is rendered, and what it is compared with.
+    """One problem: what is rendered, and what it is compared with."""
 
-    Attributes:
-        parameters: What gets gradients: vertices, texture, R and t of `render`.
-        constants: Its other arguments.
-        features: ``(B, C, H, W)`` observed.
-        mask: ``(B, H, W)`` observed.
-    """
-
-    parameters: dict[str, Tensor]
-    constants: dict[str, Any]
-    features: Tensor
-    mask: Tensor
+    parameters: dict[str, Tensor]  # what gets gradients: vertices, texture, R and t of `render`
+    constants: dict[str, Any]  # its other arguments
+    features: Tensor  # (B, C, H, W) observed
+    mask: Tensor  # (B, H, W) observed
 
     @classmethod
     def make(cls, problem: RenderWorkload, device: torch.device) -> RenderScene:

@@ -17,23 +17,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ConvexHits:
-    """Where N rays meet a surface.
+    """Where N rays meet a surface."""
 
-    Attributes:
-        hit: ``(N,)`` bool. The rows of the other arrays are meaningless where it is False.
-        distance: ``(N,)`` along the ray, in lengths of its direction.
-        points: ``(N, 3)`` on the surface.
-        normals: ``(N, 3)`` unit, outward.
-        panel: ``(N,)`` int64, which texture panel covers the point.
-        uv: ``(N, 2)`` position in the panel; [0, 1] spans it.
-    """
-
-    hit: NDArray[np.bool_]
-    distance: Array
-    points: Array
-    normals: Array
-    panel: NDArray[np.int64]
-    uv: Array
+    hit: NDArray[np.bool_]  # (N,) bool. The rows of the other arrays are meaningless where it is False.
+    distance: Array  # (N,) along the ray, in lengths of its direction
+    points: Array  # (N, 3) on the surface
+    normals: Array  # (N, 3) unit, outward
+    panel: NDArray[np.int64]  # (N,) int64, which texture panel covers the point
+    uv: Array  # (N, 2) position in the panel; [0, 1] spans it
 
 
 class ConvexSurface(Protocol):
@@ -56,17 +47,11 @@ class ConvexSurface(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Polyhedron:
-    """A convex polyhedron as the intersection of half-spaces ``normal . x <= offset``; one panel per plane.
+    """A convex polyhedron as the intersection of half-spaces ``normal . x <= offset``; one panel per plane."""
 
-    Attributes:
-        normals: ``(P, 3)`` unit, outward.
-        offsets: ``(P,)`` positive.
-        radius: Radius of an enclosing sphere around the origin.
-    """
-
-    normals: Array
-    offsets: Array
-    radius: float
+    normals: Array  # (P, 3) unit, outward
+    offsets: Array  # (P,) positive
+    radius: float  # radius of an enclosing sphere around the origin
 
     @classmethod
     def box(cls, half_sizes: tuple[float, float, float], chamfer: float = 0.0) -> Polyhedron:
@@ -108,13 +93,9 @@ class Polyhedron:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """An axis-aligned ellipsoid around the origin with the six panels of a cube map.
+    """An axis-aligned ellipsoid around the origin with the six panels of a cube map."""
 
-    Attributes:
-        radii: ``(3,)`` half axes.
-    """
-
-    radii: Array
+    radii: Array  # (3,) half axes
 
     panels: int = 6
 

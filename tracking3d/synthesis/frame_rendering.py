@@ -24,18 +24,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """An image and its truth.
+    """An image and its truth."""
 
-    Attributes:
-        image: ``(H, W, 3)`` uint8 RGB, before JPEG compression.
-        mask: ``(H, W)`` bool, the object as if nothing were in front of it.
-        visible_mask: ``(H, W)`` bool, what is seen of it.
-        depth: ``(H, W)`` float32, z of the object at the centres of the pixels of `mask`; 0 elsewhere.
-    """
-
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
-    visible_mask: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (H, W, 3) uint8 RGB, before JPEG compression
+    mask: NDArray[np.bool_]  # (H, W) bool, the object as if nothing were in front of it
+    visible_mask: NDArray[np.bool_]  # (H, W) bool, what is seen of it
+    # (H, W) float32, z of the object at the centres of the pixels of `mask`; 0 elsewhere
     depth: NDArray[np.float32]
 
 

@@ -45,15 +45,11 @@ _CLOTHS = np.array([[0.05, 0.06, 0.1], [0.3, 0.3, 0.32], [0.25, 0.06, 0.05], [0.
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where the hand touches, in its axes around the middle of the grip; M times.
+    """Where the hand touches, in its axes around the middle of the grip; M times."""
 
-    Attributes:
-        times: ``(M,)`` in frames.
-        values: ``(M, 21)``: x of the knuckles; how far the object reaches along x at each finger and the thumb; z at
-            the bend, halfway and at the tip of each finger; the same of the thumb, with z the other way round.
-    """
-
-    times: Array
+    times: Array  # (M,) in frames
+    # (M, 21): x of the knuckles; how far the object reaches along x at each finger and the thumb; z at the bend,
+    # halfway and at the tip of each finger; the same of the thumb, with z the other way round
     values: Array
 
     def at(self, time: float) -> Array:

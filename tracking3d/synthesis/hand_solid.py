@@ -18,17 +18,11 @@ _AROUND, _RINGS = 20, 5  # facets around a limb, and rings of each of its round 
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """A cylinder with round ends around two joints.
+    """A cylinder with round ends around two joints."""
 
-    Attributes:
-        start: ``(3,)`` joint.
-        end: ``(3,)`` joint.
-        radius: Radius of the cylinder and its ends.
-    """
-
-    start: Array
-    end: Array
-    radius: float
+    start: Array  # (3,) joint
+    end: Array  # (3,) joint
+    radius: float  # radius of the cylinder and its ends
 
 
 def hand_surface(limbs: Sequence[Limb], palm_centre: Array, palm_radii: Array) -> RayMesh:

@@ -28,19 +28,12 @@ _DISTANCE, _SIZE = 7.0, 0.9  # of the lamp from the object, and its radius, in o
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A round lamp.
+    """A round lamp."""
 
-    Attributes:
-        position: ``(3,)`` of its centre in camera coordinates.
-        size: Its radius.
-        brightness: ``(3,)`` factor on everything that is seen.
-        highlights: Strength of the highlights.
-    """
-
-    position: Array
-    size: float
-    brightness: Array
-    highlights: float
+    position: Array  # (3,) of its centre in camera coordinates
+    size: float  # its radius
+    brightness: Array  # (3,) factor on everything that is seen
+    highlights: float  # strength of the highlights
 
     def points(self, count: int) -> Array:
         """``(count, 3)`` points all over the lamp's disc; the first is its centre if there is one only."""

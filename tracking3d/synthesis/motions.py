@@ -27,19 +27,13 @@ STEPS = 16
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Poses over time.
+    """Poses over time."""
 
-    Attributes:
-        times: ``(M,)`` in frames, increasing.
-        rotations: M rotations, object to camera axes.
-        positions: ``(M, 3)`` of the object's origin in camera coordinates.
-        rest: Path of the place where the object stood in frame 0, in the object's axes of that frame; None if
-            object and surroundings are one.
-    """
-
-    times: Array
-    rotations: Rotation
-    positions: Array
+    times: Array  # (M,) in frames, increasing
+    rotations: Rotation  # m rotations, object to camera axes
+    positions: Array  # (M, 3) of the object's origin in camera coordinates
+    # path of the place where the object stood in frame 0, in the object's axes of that frame; None if object and
+    # surroundings are one
     rest: Path | None = None
 
     def T_cam_obj(self, times: Array) -> Array:

@@ -48,27 +48,16 @@ class Occluder(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """A hand and its path; fingertips near the origin, the arm along x, flat in z.
+    """A hand and its path; fingertips near the origin, the arm along x, flat in z."""
 
-    Attributes:
-        surface: In hand coordinates.
-        path: Path of the object.
-        radius: Radius of the object.
-        angle: Direction in the image that the hand comes from, in radians.
-        cycles: How many times it comes and goes.
-        last: Index of the last frame.
-        scale: Size of the hand.
-        reach: Distance of the fingertips from the object's centre at their closest, in object radii.
-    """
-
-    surface: RayMesh
-    path: Path
-    radius: float
-    angle: float
-    cycles: int
-    last: int
-    scale: float
-    reach: float
+    surface: RayMesh  # in hand coordinates
+    path: Path  # path of the object
+    radius: float  # radius of the object
+    angle: float  # direction in the image that the hand comes from, in radians
+    cycles: int  # how many times it comes and goes
+    last: int  # index of the last frame
+    scale: float  # size of the hand
+    reach: float  # distance of the fingertips from the object's centre at their closest, in object radii
 
     def surface_at(self, time: float) -> RayMesh:
         """See `Occluder.surface_at`: this hand never bends."""

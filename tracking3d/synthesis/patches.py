@@ -19,17 +19,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A piece of surface.
+    """A piece of surface."""
 
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)`` int64, counter-clockwise seen from outside.
-        uvs: ``(V, 2)`` in [0, 1].
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    uvs: Array
+    vertices: Array  # (V, 3)
+    faces: NDArray[np.int64]  # (F, 3) int64, counter-clockwise seen from outside
+    uvs: Array  # (V, 2) in [0, 1]
 
 
 def grid(points: Array) -> Patch:

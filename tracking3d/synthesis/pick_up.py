@@ -36,23 +36,14 @@ _SHAKE = 0.006  # of the camera's direction, relative to the vertical field of v
 
 @dataclass(frozen=True)
 class Schedule:
-    """When what happens, in frames; nothing moves but the camera before `arrive`.
+    """When what happens, in frames; nothing moves but the camera before `arrive`."""
 
-    Attributes:
-        arrive: The hand sets out.
-        grasp: It holds the object, which rises.
-        lifted: The object begins to turn.
-        lower: It sinks.
-        released: It stands again, and the hand lets go.
-        gone: The hand is out of the picture.
-    """
-
-    arrive: float
-    grasp: float
-    lifted: float
-    lower: float
-    released: float
-    gone: float
+    arrive: float  # the hand sets out
+    grasp: float  # it holds the object, which rises
+    lifted: float  # the object begins to turn
+    lower: float  # it sinks
+    released: float  # it stands again, and the hand lets go
+    gone: float  # the hand is out of the picture
 
     @classmethod
     def of(cls, spec: SequenceSpec) -> Schedule:
@@ -65,23 +56,15 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class Handling:
-    """How an object is handled.
+    """How an object is handled."""
 
-    Attributes:
-        schedule: When.
-        times: ``(M,)`` in frames.
-        rotations: M rotations of the object from where it stood.
-        positions: ``(M, 3)`` of its origin relative to where it stood, in its radii.
-        raised: ``(M,)`` from 0 on the table to 1 at full height.
-        follow: ``(M, 3)`` rotation vectors of the hand that holds it: the wrist goes along with a turn partly, and
-            turns back in the pause after it.
-    """
-
-    schedule: Schedule
-    times: Array
-    rotations: Rotation
-    positions: Array
-    raised: Array
+    schedule: Schedule  # when
+    times: Array  # (M,) in frames
+    rotations: Rotation  # m rotations of the object from where it stood
+    positions: Array  # (M, 3) of its origin relative to where it stood, in its radii
+    raised: Array  # (M,) from 0 on the table to 1 at full height
+    # (M, 3) rotation vectors of the hand that holds it: the wrist goes along with a turn partly, and turns back in
+    # the pause after it
     follow: Array
 
     @cached_property

@@ -18,17 +18,11 @@ _SAME = 1e-3  # depth in object radii within which a ray's hit and a point are o
 
 @dataclass(frozen=True, eq=False)
 class GroundTruthTracks:
-    """N surface points in T frames.
+    """N surface points in T frames."""
 
-    Attributes:
-        positions: ``(T, N, 2)`` pixels x and y, also where a point is hidden; NaN behind the camera.
-        visible: ``(T, N)`` bool: in the image, facing the camera, with nothing in front.
-        object_points: ``(N, 3)`` in object coordinates.
-    """
-
-    positions: Array
-    visible: NDArray[np.bool_]
-    object_points: Array
+    positions: Array  # (T, N, 2) pixels x and y, also where a point is hidden; NaN behind the camera
+    visible: NDArray[np.bool_]  # (T, N) bool: in the image, facing the camera, with nothing in front
+    object_points: Array  # (N, 3) in object coordinates
 
 
 def sample_point_tracks(scene: Scene, count: int = 200) -> GroundTruthTracks:

@@ -24,36 +24,22 @@ _CREASE = np.cos(np.radians(45.0))
 
 @dataclass(frozen=True, eq=False)
 class MeshHits:
-    """What N rays meet first.
+    """What N rays meet first."""
 
-    Attributes:
-        face: ``(N,)`` int64; -1 where a ray meets nothing, and what follows means nothing there.
-        distance: ``(N,)`` along the ray, in lengths of its direction; infinite where it meets nothing.
-        weights: ``(N, 3)`` barycentric coordinates.
-    """
-
-    face: NDArray[np.int64]
-    distance: Array
-    weights: Array
+    face: NDArray[np.int64]  # (N,) int64; -1 where a ray meets nothing, and what follows means nothing there
+    distance: Array  # (N,) along the ray, in lengths of its direction; infinite where it meets nothing
+    weights: Array  # (N, 3) barycentric coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class RayMesh:
-    """A mesh that rays are cast at.
+    """A mesh that rays are cast at."""
 
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)`` int64.
-        face_normals: ``(F, 3)`` unit; zero for triangles without area.
-        corner_normals: ``(F, 3, 3)`` unit normals at the corners of the faces, smooth where the surface is.
-        intersector: trimesh's, with Embree.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    face_normals: Array
-    corner_normals: Array
-    intersector: Any
+    vertices: Array  # (V, 3)
+    faces: NDArray[np.int64]  # (F, 3) int64
+    face_normals: Array  # (F, 3) unit; zero for triangles without area
+    corner_normals: Array  # (F, 3, 3) unit normals at the corners of the faces, smooth where the surface is
+    intersector: Any  # trimesh's, with Embree
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh, vertex_normals: Array | None = None) -> RayMesh:

@@ -34,32 +34,21 @@ _WIDEST = 120.0  # degrees; no tracker is given a wider field of view
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What frames are rendered from.
+    """What frames are rendered from."""
 
-    Attributes:
-        spec: What was asked for.
-        camera: The true camera of all frames.
-        given_camera: The camera given to a tracker; a wrong one if `Disturbances.wrong_fov` is on.
-        solid: The object.
-        surface: The object for rays.
-        path: Its poses over time.
-        background: ``(H, W, 3)`` linear light.
-        hand: What moves in front of it.
-        texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None if vertices have colours.
-        room: What is around the object instead of the background if the camera walks round it, else None.
-        tabletop: The table that the object is taken from instead of the background, else None.
-    """
-
-    spec: SequenceSpec
-    camera: Camera
-    given_camera: Camera
-    solid: Solid
-    surface: RayMesh
-    path: Path
-    background: NDArray[np.float32]
-    hand: Occluder | None
+    spec: SequenceSpec  # what was asked for
+    camera: Camera  # the true camera of all frames
+    given_camera: Camera  # the camera given to a tracker; a wrong one if `Disturbances.wrong_fov` is on
+    solid: Solid  # the object
+    surface: RayMesh  # the object for rays
+    path: Path  # its poses over time
+    background: NDArray[np.float32]  # (H, W, 3) linear light
+    hand: Occluder | None  # what moves in front of it
+    # (h, w, 3) linear light, no finer than the rays resolve; None if vertices have colours
     texture: NDArray[np.float32] | None
+    # what is around the object instead of the background if the camera walks round it, else None
     room: Room | None
+    # the table that the object is taken from instead of the background, else None
     tabletop: Tabletop | None = None
 
     @property

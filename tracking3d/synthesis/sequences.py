@@ -16,23 +16,14 @@ from tracking3d.synthesis.spec import SequenceSpec
 
 @dataclass(frozen=True, eq=False)
 class RenderedSequence:
-    """Images and their truth.
+    """Images and their truth."""
 
-    Attributes:
-        scene: What they show; its `Scene.T_cam_obj` are the poses.
-        images: ``(N, H, W, 3)`` uint8 RGB, before JPEG compression.
-        masks: ``(N, H, W)`` bool, the object as if nothing were in front of it.
-        visible_masks: ``(N, H, W)`` bool.
-        depth: ``(N, H, W)`` float32, z of the object in `masks`; 0 elsewhere.
-        points: Surface points and where they are seen.
-    """
-
-    scene: Scene
-    images: NDArray[np.uint8]
-    masks: NDArray[np.bool_]
-    visible_masks: NDArray[np.bool_]
-    depth: NDArray[np.float32]
-    points: GroundTruthTracks
+    scene: Scene  # what they show; its `Scene.T_cam_obj` are the poses
+    images: NDArray[np.uint8]  # (N, H, W, 3) uint8 RGB, before JPEG compression
+    masks: NDArray[np.bool_]  # (N, H, W) bool, the object as if nothing were in front of it
+    visible_masks: NDArray[np.bool_]  # (N, H, W) bool
+    depth: NDArray[np.float32]  # (N, H, W) float32, z of the object in `masks`; 0 elsewhere
+    points: GroundTruthTracks  # surface points and where they are seen
 
 
 def render_frames(scene: Scene) -> Iterator[RenderedFrame]:

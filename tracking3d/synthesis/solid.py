@@ -13,29 +13,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """An object in its own coordinates.
+    """An object in its own coordinates."""
 
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)`` int64.
-        texture: ``(H, W, 3)`` uint8, or None if the vertices have colours.
-        uvs: ``(V, 2)`` texture coordinates, v upwards; or None.
-        colours: ``(V, 3)`` uint8, or None if there is a texture.
-        millimetres: Length of the unit.
-        symmetries: ``(S, 4, 4)`` transforms that leave shape and look as they are, the identity first.
-        axis: ``(3,)`` unit, the axis through the origin of a continuous symmetry; `symmetries` then holds steps.
-        frame: Where origin and axes are, in words.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    texture: NDArray[np.uint8] | None
-    uvs: Array | None
-    colours: NDArray[np.uint8] | None
-    millimetres: float
-    symmetries: Array
+    vertices: Array  # (V, 3)
+    faces: NDArray[np.int64]  # (F, 3) int64
+    texture: NDArray[np.uint8] | None  # (H, W, 3) uint8, or None if the vertices have colours
+    uvs: Array | None  # (V, 2) texture coordinates, v upwards; or None
+    colours: NDArray[np.uint8] | None  # (V, 3) uint8, or None if there is a texture
+    millimetres: float  # length of the unit
+    symmetries: Array  # (S, 4, 4) transforms that leave shape and look as they are, the identity first
+    # (3,) unit, the axis through the origin of a continuous symmetry; `symmetries` then holds steps
     axis: Array | None
-    frame: str
+    frame: str  # where origin and axes are, in words
 
     @property
     def radius(self) -> float:

@@ -30,19 +30,12 @@ _ROWS_AT_ONCE = 128
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A painted plane, where the object stood in frame 0.
+    """A painted plane, where the object stood in frame 0."""
 
-    Attributes:
-        origin: ``(3,)`` point on it.
-        axes: ``(3, 3)``: two directions on it and its normal towards the camera, as columns.
-        picture: ``(h, w, 3)`` linear colours of it, as a camera saw them.
-        to_picture: ``(3, 3)`` homography from coordinates along the axes to pixels of the picture.
-    """
-
-    origin: Array
-    axes: Array
-    picture: NDArray[np.float32]
-    to_picture: Array
+    origin: Array  # (3,) point on it
+    axes: Array  # (3, 3): two directions on it and its normal towards the camera, as columns
+    picture: NDArray[np.float32]  # (h, w, 3) linear colours of it, as a camera saw them
+    to_picture: Array  # (3, 3) homography from coordinates along the axes to pixels of the picture
 
     def to_pixels(self, K: Array, T_cam_rest: Array) -> Array:
         """The homography ``(3, 3)`` from coordinates along the axes to pixels of a camera."""
@@ -53,15 +46,10 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Tabletop:
-    """The surroundings of an object that is taken from a table.
+    """The surroundings of an object that is taken from a table."""
 
-    Attributes:
-        table: Level, below the object.
-        wall: Upright, behind the table; it meets it at its own origin, along its first axis.
-    """
-
-    table: Plane
-    wall: Plane
+    table: Plane  # Level, below the object
+    wall: Plane  # Upright, behind the table; it meets it at its own origin, along its first axis
 
 
 def build_tabletop(spec: SequenceSpec, solid: Solid, path: Path, camera: Camera) -> Tabletop:

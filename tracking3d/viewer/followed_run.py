@@ -30,9 +30,8 @@ class FollowedRun:
     folder: Path  # the run folder
     name: str  # what the viewer calls it
     description: dict[str, Any] = field(default_factory=dict)  # what run.json says
-    frames: dict[int, FrameRecord] = field(
-        default_factory=dict
-    )  # the final estimates by frame index, in order
+    # the final estimates by frame index, in order
+    frames: dict[int, FrameRecord] = field(default_factory=dict)
     causal: dict[int, FrameRecord] = field(default_factory=dict)  # those from before the final refinement
     model: ObjectModel | None = None  # the object, once the run has written it
     reader: RunReader = field(init=False)  # gives the masks and the camera
