@@ -46,11 +46,16 @@ _SEPARATING = (
 )  # median log-ratio of the object's colours, at most 3, from and up to which they are favoured
 _FAR = 0.3  # of the root of the area: what is further from the mask is background
 _PARTED = 3.0  # pixels by which something moved as the background does rather than with the object, to be it
-_STILL = (24.0, 6.0)
+_STILL, _STILL_PLAIN = (24.0, 6.0), 4.0
 """Times what an unchanged and a changed pixel count before a camera that stands still, if a network says what else
-comes before it: with the weight of `segment` 6 log-odds, as in a search, and 3, as much as colours can say (chosen)."""
+comes before it: with the weight of `segment` 6 log-odds, as in a search, and 3, as much as colours can say; and an
+unchanged one where nothing has a texture, and the object may well have the colour of what is behind it (chosen)."""
 _PATCH = (5, 5)
 _SURELY = -0.4  # mean change in a patch, -0.5 at least, below which it shows the background (chosen)
+_TEXTURED = (
+    15,
+    30,
+)  # grey levels, at least, from the darkest to the brightest pixel of a patch of this side (chosen)
 _FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found after it was out of sight
 
 _Answer = tuple[NDArray[np.float32], Judgement]
@@ -170,12 +175,14 @@ class ColourSegmentation:
             said, occluder = self._network.log_odds(image, present, motion, self._colours, box)
             evidence += cues.network * said
             if self._background.stands_still:
-                moved &= cv2.blur(change, _PATCH) > _SURELY
+                textured = _is_textured(present.grey)
+                moved &= (cv2.blur(change, _PATCH) > _SURELY) | ~textured
                 area = np.count_nonzero(moved)
                 if area < _LEAST_PART * self._usual_area * present.window.scale**2:
                     return _out_of_sight(image)
                 unchanged, changed = _STILL
-                change = np.where(change < 0, unchanged, np.where(occluder > 0, 1, changed)) * change
+                weight = np.where(occluder > 0, 1, changed)
+                change = np.where(change < 0, np.where(textured, unchanged, _STILL_PLAIN), weight) * change
         evidence += self._cues.background * change
         if tracked_box is not None:
             evidence -= self._cues.box * distance_beyond(tracked_box, present.window)
@@ -253,6 +260,13 @@ class ColourSegmentation:
 
     def _separation(self, view: FrameCrop, mask: NDArray) -> float:
         return self._colours.separation(view.colours, *_sides(mask, view))
+
+
+def _is_textured(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """``(S, S)``: where a crop has a texture, noise aside."""
+    side, contrast = _TEXTURED
+    smooth, patch = cv2.blur(grey, (3, 3)), np.ones((side, side), np.uint8)
+    return cv2.subtract(cv2.dilate(smooth, patch), cv2.erode(smooth, patch)) > contrast
 
 
 def _sides(mask: NDArray, view: FrameCrop) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
