@@ -97,6 +97,14 @@ def test_a_host_that_does_not_exist_is_told(cache, network):
     )
 
 
+def test_what_all_addresses_fail_for_is_told_once(cache, network):
+    net = network(address="http://nowhere.invalid/n.onnx", mirrors=("http://neither.invalid/n.onnx",))
+    told = refused(cache, InputError, "could not be downloaded", fetch, net)
+    one, other = "http://nowhere.invalid/n.onnx", "http://neither.invalid/n.onnx"
+    why = told.partition("(")[2].partition(")")[0]
+    assert why.startswith(f"{one}, {other}: ") and why.count("http://") == 2
+
+
 def test_after_ctrl_c_the_next_one_asks_for_the_rest_only(cache, network, serve_and_note):
     served = serve_and_note(ranges=True)
     net = network(address=served.address)

@@ -80,7 +80,14 @@ def fetch(
             reasons[address] = reason
         else:
             alike = len(set(reasons.values())) == 1
-            why = reason if alike else "; ".join(f"{one}: {reason}" for one, reason in reasons.items())
+            every = [f"{one}: {why}" for one, why in reasons.items()]
+            why = (
+                reason
+                if len(every) == 1
+                else f"{', '.join(reasons)}: {reason}"
+                if alike
+                else "; ".join(every)
+            )
             raise InputError(
                 f"{network.name} could not be downloaded ({why}): download {addresses[-1]} elsewhere, "
                 f"{_by_hand(network)}."

@@ -7,6 +7,7 @@ workers, does it once; the command line does it when it is first started.
 from __future__ import annotations
 
 import importlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -64,13 +65,14 @@ def compile_missing() -> int:
     if not missing:
         return 0
     processes = min(os.cpu_count() or 1, _MOST_PROCESSES, len(missing))
-    with multiprocessing.get_context("spawn").Pool(processes, _ignore_ctrl_c) as pool:
+    with multiprocessing.get_context("spawn").Pool(processes, _start_quietly) as pool:
         compiled = pool.imap_unordered(compile_module, missing)
         return sum(report_each("compiling kernels", compiled, len(missing)))
 
 
-def _ignore_ctrl_c() -> None:
+def _start_quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits ends this one
+    logging.disable()  # the stage says that kernels are compiled
 
 
 if __name__ == "__main__":
