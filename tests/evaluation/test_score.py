@@ -193,16 +193,23 @@ def test_a_lost_frame_is_not_under_five_degrees_though_its_pose_is_right(write_r
     assert scores.frames_lost == 1
 
 
-@pytest.mark.parametrize("what", ["missing", "nan", "mirrored"])
+@pytest.mark.parametrize("what", ["missing", "nan"])
 def test_a_frame_without_a_usable_pose_is_half_a_turn_off(write_run, clip, what):
     poses = TRUE_POSES.copy()
-    poses[4] = {"missing": poses[4], "nan": np.full((4, 4), np.nan), "mirrored": np.diag([1, 1, -1, 1])}[what]
+    poses[4] = {"missing": poses[4], "nan": np.full((4, 4), np.nan)}[what]
     indices = [n for n in range(FRAMES) if what != "missing" or n != 4]
     scores = score_run(write_run(indices, poses), clip)
     assert scores.rotation_error_mean_deg == pytest.approx(18)
     assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-9)
     assert scores.share_under_5_deg == pytest.approx(0.9)
     assert scores.rotation_error_consecutive_median_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_a_pose_that_mirrors_is_refused_with_its_frame(write_run, clip):
+    poses = TRUE_POSES.copy()
+    poses[4] = np.diag([1, 1, -1, 1])
+    with pytest.raises(InputError, match="frame 4 is not a rotation"):
+        score_run(write_run(range(FRAMES), poses), clip)
 
 
 def test_a_run_without_any_usable_pose_is_half_a_turn_off_throughout(write_run, clip):

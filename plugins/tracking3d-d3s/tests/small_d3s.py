@@ -13,11 +13,13 @@ GRAPH = """
 small_d3s (float[1,3,SIZE,SIZE] train_imgs, float[1,3,SIZE,SIZE] test_imgs,
            float[1,1,SIZE,SIZE] train_masks, float[1,1,SIZE,SIZE] test_dist)
   => (float[1,2,SIZE,SIZE] segmentation)
-  <float one = {1.0}, float steepness = {20.0}, float far = {0.004}>
+  <float one = {1.0}, float least = {0.000001}, float steepness = {20.0}, float far = {0.004}>
 {
     rest = Sub (one, train_masks)
-    object_share = ReduceMean <axes = [2, 3]> (train_masks)
-    rest_share = ReduceMean <axes = [2, 3]> (rest)
+    mean_object = ReduceMean <axes = [2, 3]> (train_masks)
+    mean_rest = ReduceMean <axes = [2, 3]> (rest)
+    object_share = Max (mean_object, least)
+    rest_share = Max (mean_rest, least)
     of_object = Mul (train_imgs, train_masks)
     of_rest = Mul (train_imgs, rest)
     object_sum = ReduceMean <axes = [2, 3]> (of_object)

@@ -233,7 +233,7 @@ def test_beyond_the_range_it_was_fitted_on_nothing_changes():
 
 def test_after_a_loss_only_what_is_believed_is_the_object():
     verdict = assess_pose(fit(), USUAL, PoseEvidence(3), astray=True)
-    assert verdict.status is Status.LOST and "after the loss" in verdict.reason
+    assert verdict.status is Status.LOST and "after a loss" in verdict.reason
     assert assess_pose(fit(), USUAL, PoseEvidence(100), astray=True).status is Status.TRACKED
 
 
