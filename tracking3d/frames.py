@@ -16,6 +16,9 @@ Image = NDArray[np.uint8]
 TRACKED_CONFIDENCE = 0.8
 """Confidence from which a frame is `tracked`: the chance that its pose and mask are right is four in five or better."""
 
+OCCLUDER = 64
+"""Level of what is in front of the object in the image of a mask, in which the object has 255 and the rest 0."""
+
 Box = tuple[float, float, float, float]
 """``(x, y, width, height)`` in pixels; x and y are the left and upper edge of the box."""
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tracking3d.benchmark.fingerprint import masks_fingerprint
@@ -12,8 +14,12 @@ from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.variant import Variant, check_masks, degraded_iou, noise_pixels
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import read_truth
+from tracking3d.datasets.truth import MaskFile
 from tracking3d.errors import InputError
-from tracking3d.results.files import read_mask
+from tracking3d.frames import Frame, Prompt
+from tracking3d.results.files import read_mask, write_mask
+from tracking3d.trackers.precomputed import PrecomputedMasks
+from tracking3d.video.image_file import read_image
 
 
 def test_a_changed_setting_is_the_only_change():
@@ -59,6 +65,21 @@ def test_rough_masks_are_made_for_a_clip_and_the_first_one_is_true(clips, tmp_pa
     noisy = read_mask(tmp_path / "noise:3" / f"{truth.names[2]}.png")
     assert (noisy != truth.masks[2].read()).any()
     assert masks_fingerprint("hand", "narrow") == masks_fingerprint("noise:3", "narrow")
+
+
+def test_what_true_masks_have_hidden_is_an_occluder_of_the_tracker(clips, tmp_path):
+    truth = read_truth(clips / "narrow")
+    whole = truth.masks[1].read()
+    visible = whole & (np.arange(whole.shape[1]) < np.flatnonzero(whole.any(0)).mean())
+    write_mask(tmp_path / "visible.png", visible)
+    truth = replace(truth, visible_masks={0: truth.masks[0], 1: MaskFile(tmp_path / "visible.png")})
+    folder = masks_for("truth", truth, tmp_path / "masks")
+    tracker = PrecomputedMasks.from_options(PrecomputedMasks.Options(path=str(folder)))
+    first, second = (Frame(n, read_image(path), name=path.name) for n, path in enumerate(truth.frames[:2]))
+    assert tracker.init(first, Prompt((0.0, 0.0, 1.0, 1.0))).occluder is None
+    estimate = tracker.step(second)
+    np.testing.assert_array_equal(estimate.binary, visible)
+    np.testing.assert_array_equal(estimate.occluder, whole & ~visible)
 
 
 def test_a_camera_that_is_not_told_is_not_in_the_configuration(clips, scripted, tmp_path):

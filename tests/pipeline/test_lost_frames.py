@@ -136,6 +136,7 @@ def test_frames_that_were_lost_are_found_from_both_sides_before_the_refinement(m
     assert rotation_errors({one.index: one.T_cam_obj for one in refined}).max() < 8
 
 
+@pytest.mark.slow
 def test_a_run_in_which_hardly_a_frame_was_lost_is_refined_as_it_is(monkeypatch, tmp_path, video):
     monkeypatch.setattr(lost_frames, "GapTracker", lambda *given: pytest.fail("nothing was lost"))
     run(video, tmp_path / "run")
@@ -159,6 +160,7 @@ def test_a_second_start_must_explain_clearly_more(explained, better):
     assert SecondStart(4, explained, 10).is_better is better
 
 
+@pytest.mark.slow
 def test_run_json_says_where_the_refined_model_started_and_why(monkeypatch, tmp_path, video):
     first = run(video, tmp_path / "first").description["refinement"]["start"]
     assert first == {"frame": 0, "reason": "tracking began in this frame"}

@@ -122,6 +122,7 @@ def seen_share(run: Path) -> float:
     return float(find_seen_faces(load_model(run)).mean())
 
 
+@pytest.mark.slow
 def test_the_model_shows_the_sides_of_both_videos(two_runs, tmp_path):
     run, earlier = shutil.copytree(two_runs[0], tmp_path / "run"), two_runs[1]
     before = {path: path.read_bytes() for path in earlier.rglob("*") if path.is_file()}

@@ -23,6 +23,7 @@ def masks_for(source: str, truth: Truth, folder: Path) -> Path:
     """The folder of masks for one sequence, made in ``folder`` if it is not there already.
 
     Trackers see what can be seen: all but ``initial`` masks are made from those of the visible part if it is known.
+    What of the object is hidden then is marked as an occluder in those of ``truth``.
 
     Args:
         source: ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder with a folder of
@@ -34,7 +35,12 @@ def masks_for(source: str, truth: Truth, folder: Path) -> Path:
         InputError: If the sequence has no such masks.
     """
     if source == "truth":
-        return _write_masks(truth, _read_references(truth), folder)
+        _write_masks(truth, _read_references(truth), folder)
+        for n in truth.masks.keys() & truth.visible_masks.keys():
+            visible = truth.visible_masks[n].read()
+            if visible.any() and (hidden := truth.masks[n].read() & ~visible).any():
+                write_mask(folder / f"{truth.names[n]}.png", visible, hidden)
+        return folder
     if source == "initial":
         if not truth.initial_masks:
             raise InputError(f"{truth.name} comes with no initial masks; choose other --masks.")

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import OutputError
+from tracking3d.frames import OCCLUDER
 from tracking3d.results.layout import OUT, partial_path
 
-OCCLUDER = 64
-"""Level of what is in front of the object, in the images of ``initial_masks/``."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _BLOCK = 4096  # bytes that file systems give out at once
@@ -128,9 +127,12 @@ def image_file(image: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", ordered)[1].tobytes()
 
 
-def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Write ``(H, W)`` bool as a 0/255 PNG, atomically."""
-    write_atomic(path, mask_file(mask))
+def write_mask(path: Path, mask: NDArray[np.bool_], occluder: NDArray[np.bool_] | None = None) -> None:
+    """Write ``(H, W)`` bool as a 0/255 PNG, atomically; `OCCLUDER` where an ``occluder`` ``(H, W)`` is beside it."""
+    levels = np.where(mask, np.uint8(255), np.uint8(0))
+    if occluder is not None:
+        levels[occluder & ~mask] = OCCLUDER
+    write_atomic(path, image_file(levels))
 
 
 def mask_file(mask: NDArray[np.bool_]) -> bytes:

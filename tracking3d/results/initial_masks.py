@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results import layout
-from tracking3d.results.files import OCCLUDER, read_mask, write_image
+from tracking3d.results.files import read_mask, write_mask
 from tracking3d.results.visible_masks import expect_visible_masks
-
-_OBJECT = 255
 
 
 def write_initial_mask(
@@ -32,11 +30,9 @@ def write_initial_mask(
     Raises:
         OutputError: If it cannot be written.
     """
-    levels = np.where(mask, np.uint8(_OBJECT), np.uint8(0))
     if occluder is not None and occluder.any():
-        levels[occluder & ~mask] = OCCLUDER
         expect_visible_masks(folder)
-    write_image(layout.initial_mask_path(folder, index), levels)
+    write_mask(layout.initial_mask_path(folder, index), mask, occluder)
 
 
 def is_initial_mask(folder: Path, frame: Frame, estimate: MaskEstimate) -> bool:

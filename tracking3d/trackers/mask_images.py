@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from tracking3d.errors import InputError
+from tracking3d.frames import OCCLUDER
 
 
 class UnreadableMaskError(Exception):
@@ -87,6 +88,18 @@ class ImageMasks:
                 return _object_in(image) if self._object is None else _numbers_in(image) == self._object
         except Exception as error:  # decoders raise whatever a damaged file leads them to
             raise UnreadableMaskError(f"{self._files[position]} cannot be read") from error
+
+    def read_occluder(self, position: int) -> NDArray[np.bool_] | None:
+        """What is in front of the object, ``(H, W)``; None if a readable image does not say.
+
+        Grey images say it that have `OCCLUDER` beside 0 and 255 and nothing else, as those of ``initial_masks/``.
+        """
+        if self._object is not None:
+            return None
+        with warnings.catch_warnings(action="ignore"), Pillow.open(self._files[position]) as image:
+            levels = np.asarray(image) if image.mode == "L" else np.zeros((1, 1), np.uint8)
+        occluder = levels == OCCLUDER
+        return occluder if occluder.any() and (occluder | (levels == 0) | (levels == 255)).all() else None
 
 
 def split_object(path: Path) -> tuple[Path, int | None]:

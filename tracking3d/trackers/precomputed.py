@@ -99,7 +99,10 @@ class PrecomputedMasks:
         if not mask.any():
             return MaskEstimate(None, 0.0, f"the mask {self._masks.label(position)} is empty")
         self._check(mask.shape, position, frame)
-        return MaskEstimate(_resize(mask, frame.size).astype(np.float32))
+        occluder = self._masks.read_occluder(position) if isinstance(self._masks, ImageMasks) else None
+        if occluder is not None:
+            occluder = _resize(occluder, frame.size) > 0
+        return MaskEstimate(_resize(mask, frame.size).astype(np.float32), occluder=occluder)
 
     def state(self) -> None:
         """Nothing: every mask is looked up by its frame."""
