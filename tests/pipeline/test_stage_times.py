@@ -35,7 +35,7 @@ QUICK_PRESETS = {
 }
 """A preset of either solver, each with settings that are quick."""
 FRAMES, DECODING, DRAWING = 5, 0.03, 0.02
-LATE = 0.5
+LATE = 0.5  # seconds that a busy machine, or a network that is read, may add to a sleep
 
 
 @pytest.fixture(scope="module")
