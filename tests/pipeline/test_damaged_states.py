@@ -186,7 +186,7 @@ def test_a_frame_whose_mask_is_lost_is_estimated_again(runs, tmp_path, resume, d
     assert_alike(folder, runs["whole"])
 
 
-def test_a_frame_before_all_saved_states_lets_the_run_begin_again(runs, tmp_path, resume):
+def test_a_frame_before_all_saved_states_lets_the_run_restart_without_points(runs, tmp_path, resume):
     folder = shutil.copytree(runs["tracking"], tmp_path / "run")
     (folder / layout.MASKS / "000002.png").unlink()
     made, [sentence] = resume(folder)

@@ -50,7 +50,7 @@ def test_the_object_given_again_in_a_later_frame_gets_one_too(asked):
 
 
 @pytest.mark.parametrize("own", [HAND, HAND & False])
-def test_a_tracker_that_can_tell_is_believed(asked, monkeypatch, own: np.ndarray):
+def test_the_occluder_of_a_tracker_that_reports_one_is_kept(asked, monkeypatch, own: np.ndarray):
     tracker, frames = prompted("flow")
     full = np.ones((90, 120), np.float32)
     monkeypatch.setattr(GuardedTracker, "init", lambda self, frame, prompt: MaskEstimate(full, occluder=own))

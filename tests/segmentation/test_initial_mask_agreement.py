@@ -100,8 +100,8 @@ def test_a_single_mask_unlike_the_others_does_not_stand():
     assert found.of_frame(scene_of(other)) < 0.5
 
 
-def test_exact_masks_come_back_from_the_whole_video():
-    given = frames()
+def segmenter_of(given):
+    """The segmenter that has seen all frames, and the frames with answers that are spoiled."""
     known = VideoSegmenter(
         CAMERA,
         np.asarray(BALL.vertices, np.float64),
@@ -113,6 +113,12 @@ def test_exact_masks_come_back_from_the_whole_video():
         known.see(one)
     known.settle()
     spoiled = [replace(one, answer=with_a_strip(one.index, one.initial)) for one in given]
+    return known, spoiled
+
+
+def test_exact_masks_come_back_from_the_whole_video():
+    given = frames()
+    known, spoiled = segmenter_of(given)
     for (index, decided), one in zip(segment_all(known, spoiled), given, strict=True):
         assert index == one.index and decided is not None
         assert np.count_nonzero(decided.mask ^ one.initial) < 0.005 * np.count_nonzero(one.initial)
@@ -120,17 +126,7 @@ def test_exact_masks_come_back_from_the_whole_video():
 
 def test_masks_that_agree_a_little_less_are_changed_a_little_more(monkeypatch):
     given = frames()
-    known = VideoSegmenter(
-        CAMERA,
-        np.asarray(BALL.vertices, np.float64),
-        np.asarray(BALL.faces, np.int64),
-        {one.index: one.confidence for one in given},
-        has_given_masks=True,
-    )
-    for one in given:
-        known.see(one)
-    known.settle()
-    spoiled = [replace(one, answer=with_a_strip(one.index, one.initial)) for one in given]
+    known, spoiled = segmenter_of(given)
     changed = []
     for agreement in (1.0, 0.91, 0.89, 0.8, 0.6, 0.0):
         monkeypatch.setattr(InitialMaskAgreement, "of_frame", lambda found, scene, n=agreement: n)

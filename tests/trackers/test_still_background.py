@@ -62,7 +62,7 @@ def test_background_that_the_network_takes_for_the_object_stays_out_of_the_mask(
     assert iou(last_mask(frames, truth, too_much), truth[-1]) > 0.95
 
 
-def test_before_a_camera_that_moves_the_network_is_believed():
+def test_before_a_camera_that_moves_the_network_decides():
     frames, truth = moving_shape(8)
     frames = [replace(one, image=np.roll(one.image, 2 * n, axis=0)) for n, one in enumerate(frames)]
     truth = [np.roll(one, 2 * n, axis=0) for n, one in enumerate(truth)]

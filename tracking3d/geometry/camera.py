@@ -37,7 +37,7 @@ class Camera:
         cx, cy: Principal point in pixels.
         width, height: Frame size in pixels.
         origin: Where the intrinsics came from, in words; recorded in the run.
-        assumed: Whether nobody gave the focal length.
+        assumed: Whether the focal length was not given.
         lens: How the pictures that were taken differ from what this camera sees; None if they do not.
         focal_deviation: Relative standard deviation of the focal length, if it was estimated with one.
     """

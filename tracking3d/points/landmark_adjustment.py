@@ -128,7 +128,7 @@ class LandmarkScene:
 
 
 def refine_through(scene: LandmarkScene, rounds: int, camera: Camera) -> LandmarkScene:
-    """`refine_scene`, with the focal length if nobody gave it and what comes of it is a lens that a video can tell."""
+    """`refine_scene`, with the focal length if it is not given and the solved one is within the range of lenses."""
     refined = refine_scene(scene, rounds, free_focal=camera.assumed)
     return refined if camera.may_have(refined.focal_factor) else refine_scene(scene, rounds)
 

@@ -34,7 +34,7 @@ _GLIMPSE = 4
 _OUTLIER = 3.0  # deviations at which a measurement has a quarter of its weight
 _AHEAD = 1e-3  # depth from which on points have an image
 _LEAST_SHARED = 64  # points for which another thread pays
-_LENS = 0.3  # deviation of the logarithm of a focal length that nobody gave
+_LENS = 0.3  # deviation of the logarithm of a focal length that is not given
 
 
 @dataclass(frozen=True, eq=False)

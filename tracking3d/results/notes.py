@@ -69,7 +69,7 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
 
 
 def is_lens_uncertain(camera: dict[str, Any]) -> bool:
-    """Whether nobody gave the focal length, and it could not be estimated well.
+    """Whether the focal length was not given, and could not be estimated well.
 
     Args:
         camera: As ``run.json`` has it.

@@ -37,7 +37,7 @@ OPENING, READING = 10.0, 10.0
 TRIES = 3
 """Number of consecutive attempts to reconnect before the video counts as ended."""
 FORGOTTEN = 600.0
-"""Seconds after which it no longer counts that a stream ended; chosen. It may be given anew each time."""
+"""Seconds after which an end of the stream no longer counts (chosen). Its server may start it again each time."""
 PAUSE = 1.0
 """Seconds before the first attempt; the wait doubles before each further one."""
 

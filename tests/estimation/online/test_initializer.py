@@ -303,20 +303,32 @@ def test_a_map_without_points_that_misses_its_masks_is_not_accepted(asked, monke
     assert [*state.rested, *state.pending] == list(plain)
 
 
+def test_starts_from_points_stay_if_the_map_without_points_misses_its_masks(asked, monkeypatch):
+    asked["bundle"] = 0.6
+    given = belief_of(list(np.linspace(0, 60, 13)))
+
+    def missing(object_map, camera, views, weights):
+        return [InitialMap(object_map, 0.1, 0.0, "turning", camera, overlap=0.6)]
+
+    monkeypatch.setattr(initializer, "initialize_without_points", missing)
+    _, start = try_initialize(given, CONFIG, ended=True)
+    assert start is not None and start.origin == "points"
+
+
 def test_a_map_that_explains_frames_badly_for_long_is_begun_again_twice_at_most(monkeypatch):
     object_map = replace(turned_map([0.0, 10.0, 20.0]), pointless=True)
     better = replace(object_map, keyframes=object_map.keyframes[:2])
-    monkeypatch.setattr(initializer, "begin_again", lambda *_: better)
+    monkeypatch.setattr(initializer, "restart_without_points", lambda *_: better)
     state = replace(belief_of(STEADY), pending=None, object_map=object_map, misfits=4, lost_frames=2)
-    assert initializer.restart_misfit(state, CONFIG) is state
-    state = initializer.restart_misfit(replace(state, misfits=5), CONFIG)
+    assert initializer.restart_if_misfit(state, CONFIG) is state
+    state = initializer.restart_if_misfit(replace(state, misfits=5), CONFIG)
     assert state.object_map is better
     assert state.last_pose == (better.keyframes[-1].pose, better.keyframes[-1].index)
     assert (state.misfits, state.lost_frames, state.restarts) == (0, 0, 1)
-    state = initializer.restart_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
+    state = initializer.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
     assert state.object_map is better
     last = replace(state, misfits=9, object_map=object_map)
-    assert initializer.restart_misfit(last, CONFIG) is last
+    assert initializer.restart_if_misfit(last, CONFIG) is last
 
 
 def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):

@@ -1,4 +1,4 @@
-"""Photos in wide steps are joined by the points that they share, and a start that is not right is not believed."""
+"""Photos in wide steps are joined by the points that they share, and a start that is not reliable is not accepted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
     PhotoTracks,
     add_photo,
     facing,
-    is_believed,
+    is_reliable,
     keep_connected,
     overlap_of_hull,
     reverse,
@@ -240,7 +240,7 @@ def test_photos_that_agree_with_one_other_only_are_given_up():
     assert sorted(kept.photos) == [0, 1, 2, 3, 4]
 
 
-# ------------------------------------------------------------------ what is believed
+# ------------------------------------------------------------------ what is reliable
 
 
 def full_turn() -> tuple[PhotoTracks, PhotoStructure, list[Photo]]:
@@ -277,11 +277,11 @@ def test_photos_show_the_near_side_and_those_of_a_reversal_the_far_one():
 
 
 @pytest.mark.parametrize(
-    ("change", "evidence", "believed"),
+    ("change", "evidence", "reliable"),
     [({}, 1.0, True), ({}, 0.9, False), ({"cost": 0.31}, 1.0, False), ({"photos": (0, 1, 2)}, 1.0, False)],
 )
-def test_too_few_photos_points_that_fit_badly_and_a_possible_reversal_are_not_believed(
-    change, evidence, believed
+def test_too_few_photos_points_that_fit_badly_and_a_possible_reversal_are_not_reliable(
+    change, evidence, reliable
 ):
     _, truth, photos = full_turn()
-    assert is_believed(photos, replace(truth, **change), evidence) is believed
+    assert is_reliable(photos, replace(truth, **change), evidence) is reliable

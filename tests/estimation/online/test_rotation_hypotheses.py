@@ -9,7 +9,10 @@ from turned_solid import CAMERA, SIZE, degrees_apart, turned_map
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.initialization import initial_map
-from tracking3d.estimation.online.initialization.initial_map import begin_again, initialize_without_points
+from tracking3d.estimation.online.initialization.initial_map import (
+    initialize_without_points,
+    restart_without_points,
+)
 from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
     PROFILES,
@@ -139,19 +142,19 @@ def test_a_map_is_begun_again_only_if_that_is_clearly_better(monkeypatch) -> Non
         return object_map, base[0] + sum(degrees_apart(a.pose, b.pose) for a, b in pairs)
 
     monkeypatch.setattr(initial_map, "fit_jointly", off)
-    found = begin_again(astray, CAMERA, FitWeights())
+    found = restart_without_points(astray, CAMERA, FitWeights())
     assert degrees_apart(found.keyframes[-1].pose, truth.keyframes[-1].pose) < 1
     base[0] = 1e5
-    assert begin_again(astray, CAMERA, FitWeights()) is astray
+    assert restart_without_points(astray, CAMERA, FitWeights()) is astray
 
 
 @pytest.mark.slow
 def test_a_map_that_turns_the_wrong_way_is_begun_again() -> None:
     truth = turned_map([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
-    found = begin_again(map_astray(truth), CAMERA, FitWeights(smoothness=30.0))
+    found = restart_without_points(map_astray(truth), CAMERA, FitWeights(smoothness=30.0))
     assert degrees_apart(found.keyframes[-1].pose, truth.keyframes[-1].pose) < 30  # of 120 before
     right = replace(truth, pointless=True)
-    assert begin_again(right, CAMERA, FitWeights(smoothness=30.0)) is right
+    assert restart_without_points(right, CAMERA, FitWeights(smoothness=30.0)) is right
 
 
 @pytest.mark.slow

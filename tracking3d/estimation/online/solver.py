@@ -48,8 +48,12 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     needs_second_map,
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.initialization.initial_map import begin_again
-from tracking3d.estimation.online.initialization.initializer import restart_misfit, try_initialize, why_no_map
+from tracking3d.estimation.online.initialization.initial_map import restart_without_points
+from tracking3d.estimation.online.initialization.initializer import (
+    restart_if_misfit,
+    try_initialize,
+    why_no_map,
+)
 from tracking3d.estimation.online.initialization.photo_start import (
     MOST_PHOTOS,
     initial_map_of_photos,
@@ -145,7 +149,7 @@ class OnlineSolver(MapInitialization):
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
         if not self.in_background:  # a live source would wait for seconds
-            state = restart_misfit(state, self.online)
+            state = restart_if_misfit(state, self.online)
         state, estimate = self._track(state, frame, image, binary)
         if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)
@@ -168,7 +172,9 @@ class OnlineSolver(MapInitialization):
         )
         object_map, camera = state.object_map, state.camera
         if object_map.pointless and not object_map.fixed_keyframes:
-            object_map = begin_again(object_map, camera, FitWeights(smoothness=self.online.smoothness))
+            object_map = restart_without_points(
+                object_map, camera, FitWeights(smoothness=self.online.smoothness)
+            )
         object_map, camera = refine_globally(object_map, camera, self.online)
         if self.config.has_given_masks:
             state = replace(state, mask_agreement=mask_agreement(object_map, camera))

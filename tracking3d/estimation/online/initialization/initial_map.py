@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,12 +20,13 @@ from tracking3d.estimation.online.initialization.rotation_hypotheses import (
 )
 from tracking3d.estimation.online.initialization.structure_from_motion import structure_hypotheses
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.global_refinement import fit_keyframes
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape, tracks_of
 from tracking3d.estimation.online.mapping.photometric_adjustment import fit_jointly
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
+from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.prototype_start import RADIUS, place_on_mask
 from tracking3d.geometry.camera import Camera
@@ -168,17 +169,15 @@ def initialize_without_points(
         for _, found, name in tried
         for poses in vary_rotations(chosen, [view.pose for view in found.keyframes], camera)
     ]
-    tried = _distinct([*tried, *fit(varied, _FIRST_EVALUATIONS, True)], _SURVIVORS)
-    for evaluations, coarse in _STAGES:
-        tried = fit(tried, evaluations, coarse)
-    ((_, found, name),) = fit(tried[:1], _LAST_EVALUATIONS, False)
+    best = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True)])
+    ((_, found, name),) = fit([best], _LAST_EVALUATIONS, False)
     found = _without_points(found)
-    fits = _fits_of(found)
+    fits = fit_keyframes(found)
     cost, overlap = (float(np.mean([getattr(one, part) for one in fits])) for part in ("cost", "overlap"))
     return [InitialMap(found, cost, 0.0, name, camera, overlap)]
 
 
-def begin_again(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> ObjectMap:
+def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> ObjectMap:
     """A map without points from the same keyframes, begun again with other rotations, if it explains them better.
 
     More views tell hypotheses apart that the first views do not. The present rotations compete, the reversed ones, and
@@ -198,17 +197,10 @@ def begin_again(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> O
     poses = [present, reverse]
     poses += [one for other in (present, reverse) for one in vary_rotations(chosen, other, camera)]
     blank = replace(object_map, vertices=object_map.shape.rest)
-    tried = fit(
-        [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses],
-        _FIRST_EVALUATIONS,
-        True,
-    )
-    tried = _distinct(tried, _SURVIVORS)
-    for evaluations, coarse in _STAGES:
-        tried = fit(tried, evaluations, coarse)
+    tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
+    cost, found, _ = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
     as_it_is = replace(object_map, keyframes=_with_poses(chosen, present))
     ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
-    cost, found, _ = tried[0]
     return _without_points(found) if cost < _CLEARLY_BETTER * before else object_map
 
 
@@ -227,9 +219,17 @@ def _fit_hypotheses(
     fitted = []
     for _, hypothesis, name in tried:
         found, cost = fit_jointly(with_observations(hypothesis, views, coarse), modes, weights, evaluations)
-        missed = 1 - float(np.mean([fit.overlap for fit in _fits_of(found)]))
+        missed = 1 - float(np.mean([fit.overlap for fit in fit_keyframes(found)]))
         fitted.append((cost + _MISSED * missed, found, name))
     return sorted(fitted, key=lambda one: one[0])
+
+
+def _fit_survivors(fit: Callable[[list[_Fitted], int, bool], list[_Fitted]], tried: list[_Fitted]) -> _Fitted:
+    """The best hypothesis after the better ones were fitted to the end."""
+    tried = _distinct(tried, _SURVIVORS)
+    for evaluations, coarse in _STAGES:
+        tried = fit(tried, evaluations, coarse)
+    return tried[0]
 
 
 def _distinct(fitted: list[_Fitted], most: int) -> list[_Fitted]:
@@ -245,15 +245,6 @@ def _degrees_apart(one: ObjectMap, other: ObjectMap) -> float:
     """How far two maps of the same views differ in the last view's rotation; the first one's is the same."""
     last, there = one.keyframes[-1].pose, other.keyframes[-1].pose
     return math.degrees(float(rotation_angle(last.quaternion, there.quaternion)))
-
-
-def _fits_of(object_map: ObjectMap) -> list[PoseFit]:
-    """The losses of a map's keyframes."""
-    surface = object_map.surface()
-    return [
-        refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
-        for view in object_map.keyframes
-    ]
 
 
 def _spread_views(views: list[Keyframe], most: int) -> list[Keyframe]:

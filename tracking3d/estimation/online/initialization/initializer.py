@@ -19,8 +19,8 @@ from tracking3d.estimation.online.features.texture_strength import PLAIN, textur
 from tracking3d.estimation.online.initialization.image_change import image_change
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
-    begin_again,
     initialize_without_points,
+    restart_without_points,
     solve_start,
 )
 from tracking3d.estimation.online.initialization.structure_from_motion import image_deformation
@@ -182,7 +182,9 @@ def try_initialize(
         state, turning = _start_without_points(state, views, config)
         if turning is None:
             return state, None
-        starts = sorted([*starts, turning], key=lambda start: start.cost)
+        if turning.overlap < _MIN_OVERLAP and not starts:
+            return _refuse(state, views), None
+        starts = sorted([*starts, turning], key=lambda start: (start.overlap < _MIN_OVERLAP, start.cost))
     return state, starts[0] if starts else None
 
 
@@ -219,7 +221,10 @@ def _start_of_plain_object(
         views = views[last_still:]
         if len(views) < _MIN_FRAMES_WITHOUT_POINTS and not ended:
             return replace(_set_aside(state, views[0].index), waiting_reason="", ambiguous_frames=0), None
-    return _start_without_points(state, views, config)
+    state, start = _start_without_points(state, views, config)
+    if start is not None and start.overlap < _MIN_OVERLAP:
+        return _refuse(state, views), None
+    return state, start
 
 
 def _start_without_points(
@@ -230,17 +235,18 @@ def _start_without_points(
     if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= _MAX_PENDING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
-    start = initialize_without_points(
+    return state, initialize_without_points(
         state.object_map, state.camera, views, FitWeights(smoothness=config.smoothness)
     )[0]
-    if start.overlap >= _MIN_OVERLAP:
-        return state, start
-    # Another window may show more of the shape.
+
+
+def _refuse(state: SolverState, views: list[Keyframe]) -> SolverState:
+    """The state after a map without points that misses its masks: later frames may show more of the shape."""
     later = views[min(_RETRY_INTERVAL, len(views) - 1)].index
-    return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0), None
+    return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0)
 
 
-def restart_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
+def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
     """The state before the next frame, its map begun again if that has explained the last frames badly for long.
 
     It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
@@ -250,7 +256,7 @@ def restart_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
         return state
     state = replace(state, misfits=0, restarts=state.restarts + 1)
     weights = FitWeights(smoothness=config.smoothness)
-    object_map = begin_again(state.object_map, state.camera, weights)
+    object_map = restart_without_points(state.object_map, state.camera, weights)
     if object_map is state.object_map:
         return state
     last = object_map.keyframes[-1]

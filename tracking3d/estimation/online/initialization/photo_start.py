@@ -6,7 +6,7 @@ three do (`structure_hypotheses`, under several lenses). To these the others are
 the points that it shares (PnP), and all is adjusted together with the focal length (Snavely et al., "Photo tourism",
 2006). Several pairings of the photos compete, since an object may look alike from two sides.
 
-Whether the outcome is believed is told by what was not fitted: the same outlines carved from all photos must fill the
+Whether the outcome is reliable is told by what was not fitted: the same outlines carved from all photos must fill the
 mask of each, a photo must show points that face it, and the reversal in depth must fit clearly worse.
 """
 
@@ -81,7 +81,7 @@ _AGAIN = 1.3  # times as many points for another attempt
 _LEAST_ANGLE = 2.0  # degrees between the rays of a point
 _FOCAL_PHOTOS = 4  # from which the focal length is free
 _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and 8 degrees
-# A structure is believed (measured on seven sets, right ones and wrong ones): most of its cost, the ratio of the costs
+# A structure is reliable (measured on seven sets, right ones and wrong ones): most of its cost, the ratio of the costs
 # of its reversal and itself and the facing either of which is evidence enough, and the least share of masks filled.
 _FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.95
 _LEAST_JOINED = 0.4  # share of the photos that is joined at least (chosen)
@@ -444,7 +444,7 @@ class PhotoStart:
     """What came of a set of photos."""
 
     tracks: PhotoTracks
-    structure: PhotoStructure | None  # None if none is believed
+    structure: PhotoStructure | None  # None if none is reliable
     reason: str  # which photos are not joined, and what to do about that; empty if all are
 
 
@@ -470,10 +470,10 @@ def start_of_photos(photos: Sequence[Photo], camera: Camera) -> PhotoStart:
         matches = {**matches, **found}
         tracks = PhotoTracks(join_tracks(photos, matches), threshold, camera.assumed)
         solved = [_upright(tracks, one) for one in solve_photos(tracks, cameras)]
-        believed = [one for one, evidence in solved if is_believed(photos, one, evidence)]
+        reliable = [one for one, evidence in solved if is_reliable(photos, one, evidence)]
         most = 0 if best.structure is None else len(best.structure.photos)
-        if believed and len(believed[0].photos) > most:
-            best = PhotoStart(tracks, believed[0], "")
+        if reliable and len(reliable[0].photos) > most:
+            best = PhotoStart(tracks, reliable[0], "")
         if best.structure is not None and len(best.structure.photos) >= _MOST_JOINED * len(photos):
             break
     return replace(best, reason=_why_not_joined(photos, matches, best.structure))
@@ -488,7 +488,7 @@ def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure
     return found, math.log(ratio) / math.log(_CLEAR_RATIO) + facing(found) / _CLEAR_FACING
 
 
-def is_believed(photos: Sequence[Photo], found: PhotoStructure, evidence: float) -> bool:
+def is_reliable(photos: Sequence[Photo], found: PhotoStructure, evidence: float) -> bool:
     """Whether photos are joined as the object has turned: points and outlines fit, and it is not reversed in depth."""
     return (
         len(found.photos) >= max(_FEWEST_PHOTOS, _LEAST_JOINED * len(photos))

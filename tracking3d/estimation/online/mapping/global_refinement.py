@@ -8,7 +8,7 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.mapping.focal_length import lens_change, solve_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, render_cost
-from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.geometry.camera import Camera
 
@@ -42,12 +42,19 @@ def refine_globally(object_map: ObjectMap, camera: Camera, config: OnlineConfig)
 
 def keyframe_cost(object_map: ObjectMap) -> float:
     """The mean cost of the keyframes at their poses: pixels, outlines, and uncovered parts of the masks."""
-    surface = object_map.surface()
-    costs = []
-    for view in object_map.keyframes:
-        fit = refine_pose(surface, view.observation, view.pose, iterations=(0,))
-        costs.append(render_cost(fit, PoseWeights(), view.mask_weight))
+    costs = [
+        render_cost(fit, PoseWeights(), view.mask_weight)
+        for fit, view in zip(fit_keyframes(object_map), object_map.keyframes, strict=True)
+    ]
     return float(np.mean(costs)) if costs else 0.0
+
+
+def fit_keyframes(object_map: ObjectMap) -> list[PoseFit]:
+    """The losses of the keyframes at their poses, which stay."""
+    surface = object_map.surface()
+    return [
+        refine_pose(surface, view.observation, view.pose, iterations=(0,)) for view in object_map.keyframes
+    ]
 
 
 def _refine_with_lens(
