@@ -222,6 +222,21 @@ COMMAND = "tracking3d run clip.mp4 --box 1,2,3,4"
             ],
         ),
         (
+            {"iou_initial": 0.5},
+            {
+                "tracker": "csrt",
+                "assumed": True,
+                "command": f"{COMMAND} --out 'my runs/box' --tracker csrt",
+            },
+            [
+                "correct RUN 0:X,Y,WIDTH,HEIGHT",
+                "view RUN",
+                f"{COMMAND} --out RUN_again --tracker segment",
+                f"{COMMAND} --tracker csrt --out RUN_again --fov DEGREES",
+                "export RUN --to blender",
+            ],
+        ),
+        (
             {},
             {"unseen": 0.8},
             ["run SECOND_VIDEO --box X,Y,WIDTH,HEIGHT --object RUN --extend", "export RUN"],
@@ -233,7 +248,7 @@ COMMAND = "tracking3d run clip.mp4 --box 1,2,3,4"
             ["run clip.mp4 --box X,Y,WIDTH", "export"],
         ),
     ],
-    ids=["well", "plain", "lens", "masks", "unseen", "interrupted", "batch"],
+    ids=["well", "plain", "lens", "masks", "options given before", "unseen", "interrupted", "batch"],
 )
 def test_the_report_gives_the_command_for_what_to_do_next(
     run_folder, described, monkeypatch, changes, about, commands

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -79,7 +80,7 @@ def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
         source = shlex.quote(str(run.description.get("source", "VIDEO")))
         command = f"tracking3d run {source} --box X,Y,WIDTH,HEIGHT"
     command = for_new_folder(command)
-    again = f"{command} --out {shlex.quote(f'{run.folder}_again')}"
+    again = f"{_without(command, '--out')} --out {shlex.quote(f'{run.folder}_again')}"
     steps = []
     if run.state not in ("finished", "running") and has_state(run.folder):
         steps.append(Advice("Continue the run from where it stopped.", (f"{command} --resume",)))
@@ -97,7 +98,9 @@ def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
         )
     better = _BETTER_TRACKERS.get((run.config.get("tracker") or {}).get("name", ""))
     if len(implausible) > _FEW * len(records) and better:
-        steps.append(Advice("Try another mask tracker.", (f"{again} --tracker {better}",)))
+        steps.append(
+            Advice("Try another mask tracker.", (f"{_without(again, '--tracker')} --tracker {better}",))
+        )
     reliable = 2 * _tracked(records) >= len(records)
     if not reliable:
         steps.append(
@@ -126,6 +129,12 @@ def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
     else:
         take = Advice("Take the masks elsewhere.", (f"tracking3d export {name} --to coco",))
     return [*steps, take]
+
+
+def _without(command: str, option: str) -> str:
+    """A command line without an option and its value."""
+    value = r"(?:'[^']*'|[^'\s])+"
+    return re.sub(rf" {option}(?: |=){value}", "", command)
 
 
 def _tracked(records: Sequence[FrameRecord]) -> int:
