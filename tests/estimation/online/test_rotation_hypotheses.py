@@ -144,6 +144,15 @@ def test_a_map_is_begun_again_only_if_that_is_clearly_better(monkeypatch) -> Non
     monkeypatch.setattr(initial_map, "fit_jointly", off)
     found = restart_without_points(astray, CAMERA, FitWeights())
     assert degrees_apart(found.keyframes[-1].pose, truth.keyframes[-1].pose) < 1
+    # Two that turn differently, and explain the views alike, replace nothing.
+    monkeypatch.setattr(initial_map, "fit_jointly", lambda object_map, *_: (object_map, alike(object_map)))
+
+    def alike(object_map: ObjectMap) -> float:
+        pairs = zip(object_map.keyframes, astray.keyframes, strict=True)
+        return 50.0 if any(degrees_apart(a.pose, b.pose) > 1 for a, b in pairs) else 100.0
+
+    assert restart_without_points(astray, CAMERA, FitWeights()) is astray
+    monkeypatch.setattr(initial_map, "fit_jointly", off)
     base[0] = 1e5
     assert restart_without_points(astray, CAMERA, FitWeights()) is astray
 

@@ -48,7 +48,9 @@ _VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted to
 _STAGES = ((8, True), (5, False))  # evaluations of the survivors, and whether at half resolution
 _LAST_EVALUATIONS = 5  # of the best one
 _VIEWS_AGAIN = 12  # keyframes from which a map is begun again (chosen)
-_CLEARLY_BETTER = 0.95  # share of the present map's cost (chosen)
+_CLEARLY_BETTER = (
+    0.95  # share of the costs of the present map and of the best rival that turns otherwise (chosen)
+)
 _SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
 _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
@@ -169,7 +171,7 @@ def initialize_without_points(
         for _, found, name in tried
         for poses in vary_rotations(chosen, [view.pose for view in found.keyframes], camera)
     ]
-    best = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True)])
+    best, *_ = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True)])
     ((_, found, name),) = fit([best], _LAST_EVALUATIONS, False)
     found = _without_points(found)
     fits = fit_keyframes(found)
@@ -198,10 +200,12 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     poses += [one for other in (present, reverse) for one in vary_rotations(chosen, other, camera)]
     blank = replace(object_map, vertices=object_map.shape.rest)
     tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
-    cost, found, _ = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
+    (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
     as_it_is = replace(object_map, keyframes=_with_poses(chosen, present))
     ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
-    return _without_points(found) if cost < _CLEARLY_BETTER * before else object_map
+    others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
+    clear = cost < _CLEARLY_BETTER * min(before, *others)
+    return _without_points(found) if clear else object_map
 
 
 _Fitted = tuple[float, ObjectMap, str]
@@ -224,12 +228,14 @@ def _fit_hypotheses(
     return sorted(fitted, key=lambda one: one[0])
 
 
-def _fit_survivors(fit: Callable[[list[_Fitted], int, bool], list[_Fitted]], tried: list[_Fitted]) -> _Fitted:
-    """The best hypothesis after the better ones were fitted to the end."""
+def _fit_survivors(
+    fit: Callable[[list[_Fitted], int, bool], list[_Fitted]], tried: list[_Fitted]
+) -> list[_Fitted]:
+    """The better hypotheses, fitted to the end, by rising cost."""
     tried = _distinct(tried, _SURVIVORS)
     for evaluations, coarse in _STAGES:
         tried = fit(tried, evaluations, coarse)
-    return tried[0]
+    return tried
 
 
 def _distinct(fitted: list[_Fitted], most: int) -> list[_Fitted]:
