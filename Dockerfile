@@ -10,8 +10,9 @@ RUN python -m venv --without-pip /opt/tracking3d
 COPY pyproject.toml setup.py README.md LICENSE constraints.txt ./
 COPY configs configs
 COPY tracking3d tracking3d
+COPY plugins/tracking3d-bench plugins/tracking3d-bench
 RUN pip --python /opt/tracking3d install --no-cache-dir --no-compile -c constraints.txt \
-    --extra-index-url https://download.pytorch.org/whl/cpu .
+    --extra-index-url https://download.pytorch.org/whl/cpu . ./plugins/tracking3d-bench
 # What no run needs: headers, and the tests of what was installed.
 RUN cd /opt/tracking3d/lib/python3.12/site-packages \
     && rm -rf torch/include torch/test torch/share \

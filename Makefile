@@ -27,7 +27,7 @@ test: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	@said=$$(mktemp); trap 'rm -f "$$said"' EXIT; \
 	echo "$(BIN)/mypy &"; $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
-	$(BIN)/python -m tracking3d.speed.kernels_ahead 2>/dev/null; \
+	$(BIN)/python -m tracking3d.runtime.kernels_ahead 2>/dev/null; \
 	echo "$(TESTS)"; $(TESTS); tests=$$?; \
 	wait $$types; types=$$?; cat "$$said"; exit $$((tests || types))
 
@@ -39,7 +39,7 @@ docs: $(VENV)/installed-docs
 clean:
 	rm -rf $(VENV) demo build *.egg-info plugins/*/build plugins/*/*.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache
-	find tracking3d benchmarks tests plugins -name __pycache__ -type d -prune -exec rm -rf {} +
+	find tracking3d tests plugins -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Editable, so that what runs is what lies here, without installing again after a change. Plug-ins are built with what
 # `dev` installs, and not each in an environment of its own.
@@ -49,9 +49,9 @@ $(VENV)/created:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
+$(VENV)/installed: $(VENV)/created pyproject.toml plugins/tracking3d-bench/pyproject.toml constraints.txt
 	@echo "Installing into $(VENV); the first time this downloads torch and takes a minute or more."
-	$(INSTALL) -e .
+	$(INSTALL) -e . -e ./plugins/tracking3d-bench
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt $(wildcard plugins/*/pyproject.toml)

@@ -16,11 +16,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from tracking3d.benchmark import feature_encoders
 from tracking3d.estimation.online import solver
 from tracking3d.estimation.online.initialization import initializer
-from tracking3d.synthesis import convex_clips, ray_casting, scene
+from tracking3d.synthesis import convex_clips
 from tracking3d.trackers import first_mask
+from tracking3d_bench.benchmark import feature_encoders
+from tracking3d_bench.synthesis import ray_casting, scene
 
 
 class MadeOnce:

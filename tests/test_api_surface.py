@@ -20,8 +20,8 @@ from typing import Any
 import pytest
 
 import tracking3d
-from tracking3d.evaluation.score import Scores
 from tracking3d.results.run_reader import RunReader
+from tracking3d_bench.evaluation.score import Scores
 
 EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session StageProgress Status __version__
@@ -51,36 +51,36 @@ AT_LEAST = {
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",
-    "tracking3d.benchmark.compare": "MeasureComparison compare interval",
-    "tracking3d.benchmark.results": "ResultSet read_results write_results",
-    "tracking3d.benchmark.suite": "run_suite",
-    "tracking3d.benchmark.tables": "TABLES",
-    "tracking3d.benchmark.variant": "Variant",
+    "tracking3d_bench.benchmark.compare": "MeasureComparison compare interval",
+    "tracking3d_bench.benchmark.results": "ResultSet read_results write_results",
+    "tracking3d_bench.benchmark.suite": "run_suite",
+    "tracking3d_bench.benchmark.tables": "TABLES",
+    "tracking3d_bench.benchmark.variant": "Variant",
     "tracking3d.pipeline.correct": "correct_run",
     "tracking3d.prompts.corrections": "Correction parse_correction",
-    "tracking3d.datasets.answers": "Answers PointTracker",
-    "tracking3d.datasets.bop_export": "write_bop",
-    "tracking3d.datasets.clip": "Truth read_truth write_clip",
-    "tracking3d.datasets.layout": "DatasetLayout builtin_layouts load_layout",
-    "tracking3d.datasets.readers": "read_answers",
-    "tracking3d.datasets.reading": "list_sequences read_sequence",
-    "tracking3d.datasets.run_answers": "answers_of_run",
-    "tracking3d.datasets.truth": "DepthFile MaskFile MaskReference MeshFile PointTruth Truth",
-    "tracking3d.evaluation.alignment": """ObjectAlignment align_object_frame align_on_frame translation_errors""",
-    "tracking3d.evaluation.bop": "add adi average_recall model_diameter mspd mssd",
-    "tracking3d.evaluation.boundary": "boundary_f davis_jaccard davis_statistics",
-    "tracking3d.evaluation.calibration": "detection_scores expected_calibration_error reliability",
-    "tracking3d.evaluation.shape": "shape_scores",
-    "tracking3d.evaluation.sources": "open_answers",
-    "tracking3d.evaluation.tapvid": "tapvid_scores to_tapvid_raster",
-    "tracking3d.evaluation.vot": "long_term_scores rectangle_overlap",
-    "tracking3d.evaluation.vsd": "vsd",
-    "tracking3d.evaluation.metrics": """aligned_rotation_errors anchored_rotation_errors
+    "tracking3d_bench.datasets.answers": "Answers PointTracker",
+    "tracking3d_bench.datasets.bop_export": "write_bop",
+    "tracking3d_bench.datasets.clip": "Truth read_truth write_clip",
+    "tracking3d_bench.datasets.layout": "DatasetLayout builtin_layouts load_layout",
+    "tracking3d_bench.datasets.readers": "read_answers",
+    "tracking3d_bench.datasets.reading": "list_sequences read_sequence",
+    "tracking3d_bench.datasets.run_answers": "answers_of_run",
+    "tracking3d_bench.datasets.truth": "DepthFile MaskFile MaskReference MeshFile PointTruth Truth",
+    "tracking3d_bench.evaluation.alignment": """ObjectAlignment align_object_frame align_on_frame translation_errors""",
+    "tracking3d_bench.evaluation.bop": "add adi average_recall model_diameter mspd mssd",
+    "tracking3d_bench.evaluation.boundary": "boundary_f davis_jaccard davis_statistics",
+    "tracking3d_bench.evaluation.calibration": "detection_scores expected_calibration_error reliability",
+    "tracking3d_bench.evaluation.shape": "shape_scores",
+    "tracking3d_bench.evaluation.sources": "open_answers",
+    "tracking3d_bench.evaluation.tapvid": "tapvid_scores to_tapvid_raster",
+    "tracking3d_bench.evaluation.vot": "long_term_scores rectangle_overlap",
+    "tracking3d_bench.evaluation.vsd": "vsd",
+    "tracking3d_bench.evaluation.metrics": """aligned_rotation_errors anchored_rotation_errors
         consecutive_rotation_errors mask_iou rotation_alignment share_under""",
-    "tracking3d.evaluation.score": "Scores score score_run",
-    "tracking3d.synthesis.mask_degradation": "Faults degrade_to_iou",
-    "tracking3d.synthesis.spec": "Disturbances SequenceSpec",
-    "tracking3d.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
+    "tracking3d_bench.evaluation.score": "Scores score score_run",
+    "tracking3d_bench.synthesis.mask_degradation": "Faults degrade_to_iou",
+    "tracking3d_bench.synthesis.spec": "Disturbances SequenceSpec",
+    "tracking3d_bench.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
     "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
         synthesize""",
     "tracking3d.export.exporter": "Exporter",
@@ -121,7 +121,7 @@ AT_LEAST = {
     "tracking3d.trackers.protocol": "CorrectableTracker MaskTracker Options",
     "tracking3d.trackers.segmentation": "ColourSegmentation",
     "tracking3d.trackers.mask_from_points": "mask_from_points",
-    "tracking3d.vot": "VotTracker",
+    "tracking3d_bench.vot": "VotTracker",
 }
 """Modules that the documentation sends users to, or that hold what the above take and give."""
 

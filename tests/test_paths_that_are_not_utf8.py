@@ -29,7 +29,7 @@ DEPTH = """
 import sys
 from pathlib import Path
 import cv2, numpy as np
-from tracking3d.datasets.truth import DepthFile
+from tracking3d_bench.datasets.truth import DepthFile
 from tracking3d.errors import InputError
 file = Path(sys.argv[1])
 for content in (cv2.imencode(".png", np.full((3, 4), 500, np.uint16))[1].tobytes(), b"", b"no image"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tracking3d.runtime.deferred_import import import_on_use
+from tracking3d.runtime.moved_modules import find_moved_modules
 
 __version__ = "0.1.0"
 
@@ -63,3 +64,5 @@ _HOME = {
 
 # `tracking3d --help` need not wait for torch.
 __getattr__ = import_on_use(__name__, _HOME)
+
+find_moved_modules()

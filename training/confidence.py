@@ -25,26 +25,26 @@ from pathlib import Path
 
 import numpy as np
 
-from tracking3d.benchmark.job import JOB, RUN, Job
-from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.state.confidence import confidence_features
-from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
-from tracking3d.evaluation.confidence_fit import (
+from tracking3d.points.landmark_adjustment import LandmarkSupport
+from tracking3d.reconstruction.confidence import refined_confidence_features as supported_by
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+from tracking3d_bench.benchmark.job import JOB, RUN, Job
+from tracking3d_bench.datasets.run_answers import answers_of_run
+from tracking3d_bench.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
+from tracking3d_bench.evaluation.confidence_fit import (
     PENALTY,
     LogisticConfidence,
     as_python_source,
     fit_confidence,
     halves,
 )
-from tracking3d.evaluation.confidence_scores import right_frames
-from tracking3d.evaluation.mask_scores import compare_masks
-from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
-from tracking3d.points.landmark_adjustment import LandmarkSupport
-from tracking3d.reconstruction.confidence import refined_confidence_features as supported_by
-from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader
+from tracking3d_bench.evaluation.confidence_scores import right_frames
+from tracking3d_bench.evaluation.mask_scores import compare_masks
+from tracking3d_bench.evaluation.pose_scores import pair_poses, rotation_errors
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from tracking3d import load_config
-from tracking3d.benchmark.job import Job, run_job
-from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.masks import frame_estimates
 from tracking3d.estimation.online.masks.mask_fusion import mask_in_window, upsampled_window
 from tracking3d.segmentation import SOURCES, as_lab, online_features, pixel_features
+from tracking3d_bench.benchmark.job import Job, run_job
+from tracking3d_bench.benchmark.variant import Variant
 
 PIXELS = 500
 """Of a frame, at most; each frame counts the same."""

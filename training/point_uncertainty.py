@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tracking3d.benchmark.point_runs import PointErrors, finished_jobs, measure_run
+from tracking3d_bench.benchmark.point_runs import PointErrors, finished_jobs, measure_run
 
 QUANTILE = 0.95
 

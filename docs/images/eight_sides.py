@@ -18,10 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tracking3d.datasets.clip import read_truth
-from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.evaluation.pose_scores import fit_alignment, pair_poses
 from tracking3d.frames import Image
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction.rebuild import EXTENDS
@@ -29,6 +26,9 @@ from tracking3d.results import layout
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.mesh_view import render_view
 from tracking3d.results.run_reader import RunReader
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.datasets.run_answers import answers_of_run
+from tracking3d_bench.evaluation.pose_scores import fit_alignment, pair_poses
 
 SIDES, SIDE, TILT = 8, 150, 20.0
 GREY, QUALITY = 190, 88

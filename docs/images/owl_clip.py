@@ -20,18 +20,18 @@ from owl import build_owl
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import write_clip
-from tracking3d.synthesis.camera_effects import compress as encode_jpeg
-from tracking3d.synthesis.camera_effects import linear
-from tracking3d.synthesis.frame_rendering import render_frame
-from tracking3d.synthesis.lighting import lamp_at
-from tracking3d.synthesis.motions import Path as Motion
-from tracking3d.synthesis.ray_casting import RayMesh
-from tracking3d.synthesis.room import Room
-from tracking3d.synthesis.room_rendering import room_light
-from tracking3d.synthesis.scene import Scene, make_scene
-from tracking3d.synthesis.spec import Disturbances, SequenceSpec
-from tracking3d.synthesis.texture_lookup import pyramid
+from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d_bench.synthesis.camera_effects import compress as encode_jpeg
+from tracking3d_bench.synthesis.camera_effects import linear
+from tracking3d_bench.synthesis.frame_rendering import render_frame
+from tracking3d_bench.synthesis.lighting import lamp_at
+from tracking3d_bench.synthesis.motions import Path as Motion
+from tracking3d_bench.synthesis.ray_casting import RayMesh
+from tracking3d_bench.synthesis.room import Room
+from tracking3d_bench.synthesis.room_rendering import room_light
+from tracking3d_bench.synthesis.scene import Scene, make_scene
+from tracking3d_bench.synthesis.spec import Disturbances, SequenceSpec
+from tracking3d_bench.synthesis.texture_lookup import pyramid
 
 Array = NDArray[np.float64]
 

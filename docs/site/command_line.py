@@ -1,6 +1,6 @@
 """Writes docs/command-line.md from the help of the program; a test says when it has to be run again.
 
-The commands with which trackers are measured have a page beside the scripts for that, benchmarks/command-line.md.
+The commands with which trackers are measured, of tracking3d-bench, have a page beside the scripts for that.
 
 $ python docs/site/command_line.py
 """
@@ -36,7 +36,8 @@ Commands that take longer than a moment say on the standard error what they are 
 on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 
 `synth`, `evaluate` and `bench`, with which trackers are measured, are on
-[a page of the repository](../benchmarks/command-line.md); [measures](../benchmarks/measures.md) begins with them.
+[a page of tracking3d-bench](../plugins/tracking3d-bench/benchmarks/command-line.md), the distribution that has them;
+[measures](../plugins/tracking3d-bench/benchmarks/measures.md) begins with them.
 
 | exit code | |
 |---|---|
@@ -50,13 +51,14 @@ on a terminal in a line that disappears at the end, elsewhere every ten seconds.
 MEASURING_HEAD = """# Commands that measure
 
 What `tracking3d synth`, `evaluate` and `bench` print with `--help`, as one page (`docs/site/command_line.py` makes it).
-[The command line](../docs/command-line.md) has all others, and what holds for every command.
+[The command line](../../../docs/command-line.md) has all others, and what holds for every command.
 """
 
 
 def pages() -> dict[Path, str]:
     """Every page that is made here, as Markdown."""
-    commands = typer.main.get_command(app).commands
+    program = typer.main.get_command(app)
+    commands = {name: program.get_command(None, name) for name in program.list_commands(None)}
     known = set(rows_of(commands["run"]))
     used, measuring = (
         [
@@ -69,7 +71,7 @@ def pages() -> dict[Path, str]:
     )
     return {
         ROOT / "docs/command-line.md": "\n".join([HEAD, *used]),
-        ROOT / "benchmarks/command-line.md": "\n".join([MEASURING_HEAD, *measuring]),
+        ROOT / "plugins/tracking3d-bench/benchmarks/command-line.md": "\n".join([MEASURING_HEAD, *measuring]),
     }
 
 

@@ -15,12 +15,11 @@ from small_videos import BOX, write_video
 
 from tracking3d.batch.listing import NO_PROMPT, dataset_jobs, list_jobs
 from tracking3d.batch.storage import absolute, join_path, local
-from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import write_clip
 from tracking3d.errors import InputError
 from tracking3d.results.files import write_mask
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d_bench.benchmark.sequences import open_dataset
 
 
 def jobs_of(place, configure=lambda row: load_config()):

@@ -15,19 +15,18 @@ from batch_passes import ABORTING, DAMAGED, FILLING, Asked, demonstrate, make_cl
 from machine_load import load_now
 from tracking3d.batch.running import run_batch
 from tracking3d.batch.video_job import VideoJob
-from tracking3d.benchmark.job import Job
-from tracking3d.benchmark.pool import run_jobs
-from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import write_clip
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine
 from tracking3d.engines.protocol import Ended, Task
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d_bench.benchmark.job import Job
+from tracking3d_bench.benchmark.pool import run_jobs
+from tracking3d_bench.benchmark.variant import Variant
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 pytestmark = [
     pytest.mark.slow,

@@ -6,10 +6,9 @@ import shutil
 
 import pytest
 
-from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import write_clip
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d_bench.benchmark.variant import Variant
 
 QUICK = ["crop.size=32", "object.frequency=2", "camera.fov=45"]
 

@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.point_methods import chained_dense_flow, chained_lucas_kanade
-from tracking3d.benchmark.point_runs import (
+from tracking3d.errors import InputError
+from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error
+from tracking3d_bench.benchmark.point_methods import chained_dense_flow, chained_lucas_kanade
+from tracking3d_bench.benchmark.point_runs import (
     LONG,
     METHODS,
     MeasuredRun,
@@ -14,9 +16,7 @@ from tracking3d.benchmark.point_runs import (
     finished_jobs,
     returns,
 )
-from tracking3d.benchmark.point_table import format_points, point_report
-from tracking3d.errors import InputError
-from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error
+from tracking3d_bench.benchmark.point_table import format_points, point_report
 
 
 @pytest.mark.parametrize("method", [chained_lucas_kanade, chained_dense_flow])

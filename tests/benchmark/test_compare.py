@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.compare import compare, interval
-from tracking3d.benchmark.results import ResultSet
 from tracking3d.errors import InputError
+from tracking3d_bench.benchmark.compare import compare, interval
+from tracking3d_bench.benchmark.results import ResultSet
 
 
 def results(label, values, measure="iou_mean", dataset="standard", **about):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tracking3d.benchmark.input_change import InputChange
-from tracking3d.datasets.truth import PointTruth, Truth
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
+from tracking3d_bench.benchmark.input_change import InputChange
+from tracking3d_bench.datasets.truth import PointTruth, Truth
 
 CAMERA = Camera(500.0, 510.0, 31.5, 23.5, 64, 48)
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tracking3d.benchmark import live
 from tracking3d.cli import app
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError
 from tracking3d.runtime.stage_times import StageTimes
+from tracking3d_bench.benchmark import live
+from tracking3d_bench.datasets.clip import read_truth
 
 
 @pytest.fixture

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tracking3d.benchmark.mask_table import format_masks, report
-from tracking3d.benchmark.mask_trackers import (
+from tracking3d.config.models import PluginChoice
+from tracking3d.errors import InputError
+from tracking3d_bench.benchmark.mask_table import format_masks, report
+from tracking3d_bench.benchmark.mask_trackers import (
     FLOW_CUES,
     Contestant,
     TrackedFrame,
@@ -19,11 +21,9 @@ from tracking3d.benchmark.mask_trackers import (
     measure_trackers,
     overall,
 )
-from tracking3d.benchmark.sequences import open_dataset
-from tracking3d.config.models import PluginChoice
-from tracking3d.datasets.clip import read_truth
-from tracking3d.errors import InputError
-from tracking3d.evaluation.metrics import mask_iou
+from tracking3d_bench.benchmark.sequences import open_dataset
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 FLOW = "tracking3d.trackers:flow=tracking3d.trackers.flow:FlowTracker"
 

@@ -11,8 +11,11 @@ from PIL import Image
 from torch.nn import functional
 from typer.testing import CliRunner
 
-from tracking3d.benchmark import matching
-from tracking3d.benchmark.feature_encoders import (
+from tracking3d.errors import InputError, PluginError
+from tracking3d.features.rgb import RgbEncoder
+from tracking3d.plugins.guard import PluginFailure
+from tracking3d_bench.benchmark import matching
+from tracking3d_bench.benchmark.feature_encoders import (
     MeasuredEncoder,
     build_encoders,
     measure_encoders,
@@ -20,11 +23,8 @@ from tracking3d.benchmark.feature_encoders import (
     parse_encoder,
     read_images,
 )
-from tracking3d.benchmark.matching import MatchingPair, MatchingScores, make_pairs, matching_scores
-from tracking3d.benchmark.matching_table import format_matching, matching_report, time_ratios
-from tracking3d.errors import InputError, PluginError
-from tracking3d.features.rgb import RgbEncoder
-from tracking3d.plugins.guard import PluginFailure
+from tracking3d_bench.benchmark.matching import MatchingPair, MatchingScores, make_pairs, matching_scores
+from tracking3d_bench.benchmark.matching_table import format_matching, matching_report, time_ratios
 
 SIZE = 64
 

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from tracking3d.benchmark import job as job_module
-from tracking3d.benchmark import pool
-from tracking3d.benchmark.job import Job
-from tracking3d.benchmark.pool import run_jobs
 from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d_bench.benchmark import job as job_module
+from tracking3d_bench.benchmark import pool
+from tracking3d_bench.benchmark.job import Job
+from tracking3d_bench.benchmark.pool import run_jobs
 
 
 @pytest.fixture

@@ -9,8 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.pool import JobOutcome
-from tracking3d.benchmark.results import (
+from tracking3d.config.loading import load_config
+from tracking3d.errors import InputError
+from tracking3d_bench.benchmark.pool import JobOutcome
+from tracking3d_bench.benchmark.results import (
     ResultSet,
     collect,
     figure,
@@ -18,10 +20,8 @@ from tracking3d.benchmark.results import (
     read_results,
     write_results,
 )
-from tracking3d.benchmark.sequences import Dataset
-from tracking3d.benchmark.variant import Variant
-from tracking3d.config.loading import load_config
-from tracking3d.errors import InputError
+from tracking3d_bench.benchmark.sequences import Dataset
+from tracking3d_bench.benchmark.variant import Variant
 
 SCORES = {"a": {"iou_mean": 0.5, "frames_lost": 2}, "b": {"iou_mean": 0.7, "frames_lost": None}, "c": None}
 RESULTS = ResultSet("mine", "standard", SCORES, {"c": "it crashed"}, {"suite_version": 1, "masks": "truth"})

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
-from tracking3d.synthesis import suite as suite_module
+from tracking3d_bench.synthesis import suite as suite_module
 
 
 @pytest.mark.parametrize("sequences", [1, pytest.param(3, marks=pytest.mark.slow)])

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.benchmark import solver_table
-from tracking3d.benchmark.results import ResultSet
-from tracking3d.benchmark.sequences import Dataset
-from tracking3d.benchmark.solver_table import (
+from tracking3d.config.loading import load_config
+from tracking3d.errors import InputError
+from tracking3d.pipeline.track import SOLVERS
+from tracking3d_bench.benchmark import solver_table
+from tracking3d_bench.benchmark.results import ResultSet
+from tracking3d_bench.benchmark.sequences import Dataset
+from tracking3d_bench.benchmark.solver_table import (
     fill,
     format_table,
     plan,
@@ -22,10 +25,7 @@ from tracking3d.benchmark.solver_table import (
     to_markdown,
     write_table,
 )
-from tracking3d.benchmark.variant import Variant
-from tracking3d.config.loading import load_config
-from tracking3d.errors import InputError
-from tracking3d.pipeline.track import SOLVERS
+from tracking3d_bench.benchmark.variant import Variant
 
 BASE = Variant(label="default", config=load_config(), masks="truth")
 SUITE = Dataset("hard", 1, "clip", Path("nowhere"), ("a", "b", "c"))

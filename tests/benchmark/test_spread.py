@@ -14,15 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tracking3d.benchmark import spread, spread_variants, suite
-from tracking3d.benchmark.input_change import InputChange
-from tracking3d.benchmark.job import Job
-from tracking3d.benchmark.noisy_frames import NoisyFrames
-from tracking3d.benchmark.pool import JobOutcome
-from tracking3d.benchmark.processors import KERNELS, Kernels, detect_kernels
-from tracking3d.benchmark.results import ResultSet
-from tracking3d.benchmark.sequences import Dataset
-from tracking3d.benchmark.spread import (
+from tracking3d.config.loading import load_config
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d_bench.benchmark import spread, spread_variants, suite
+from tracking3d_bench.benchmark.input_change import InputChange
+from tracking3d_bench.benchmark.job import Job
+from tracking3d_bench.benchmark.noisy_frames import NoisyFrames
+from tracking3d_bench.benchmark.pool import JobOutcome
+from tracking3d_bench.benchmark.processors import KERNELS, Kernels, detect_kernels
+from tracking3d_bench.benchmark.results import ResultSet
+from tracking3d_bench.benchmark.sequences import Dataset
+from tracking3d_bench.benchmark.spread import (
     UNCHANGED,
     describe_flips,
     flips,
@@ -32,12 +35,9 @@ from tracking3d.benchmark.spread import (
     to_markdown,
     write_spreads,
 )
-from tracking3d.benchmark.spread_variants import computation_variants, input_variants
-from tracking3d.benchmark.suite import run_suite
-from tracking3d.benchmark.variant import Variant
-from tracking3d.config.loading import load_config
-from tracking3d.errors import InputError
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d_bench.benchmark.spread_variants import computation_variants, input_variants
+from tracking3d_bench.benchmark.suite import run_suite
+from tracking3d_bench.benchmark.variant import Variant
 
 BASE = Variant(label="default", config=load_config(), masks="truth")
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.benchmark import paper_numbers, table, tables
-from tracking3d.benchmark.results import ResultSet
-from tracking3d.benchmark.sequences import Dataset
-from tracking3d.benchmark.table import fill, format_table, to_csv, to_json, to_markdown, write_table
-from tracking3d.benchmark.table_plot import plot_table
-from tracking3d.benchmark.tables import LOSSES, TABLES
-from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
+from tracking3d_bench.benchmark import paper_numbers, table, tables
+from tracking3d_bench.benchmark.results import ResultSet
+from tracking3d_bench.benchmark.sequences import Dataset
+from tracking3d_bench.benchmark.table import fill, format_table, to_csv, to_json, to_markdown, write_table
+from tracking3d_bench.benchmark.table_plot import plot_table
+from tracking3d_bench.benchmark.tables import LOSSES, TABLES
+from tracking3d_bench.benchmark.variant import Variant
 
 BASE = Variant(label="default", config=load_config(preset="rerendering"))
 SUITE = Dataset("standard", 1, "clip", Path("nowhere"), ("01_box", "05_card_flip"))

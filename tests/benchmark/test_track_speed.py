@@ -8,12 +8,12 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from tracking3d.benchmark import track_speed
-from tracking3d.benchmark.track_speed import Contender, TrackSpeed, as_figures, check_out
-from tracking3d.benchmark.track_speed_table import plot_stages, speed_table, stage_table
 from tracking3d.cli import app
 from tracking3d.errors import InputError, OutputError
 from tracking3d.runtime.stage_times import STAGES, StageTimes
+from tracking3d_bench.benchmark import track_speed
+from tracking3d_bench.benchmark.track_speed import Contender, TrackSpeed, as_figures, check_out
+from tracking3d_bench.benchmark.track_speed_table import plot_stages, speed_table, stage_table
 
 
 def speed(name: str, factor: float, refinement: float | None = 0.1) -> TrackSpeed:

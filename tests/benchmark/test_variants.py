@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.fingerprint import masks_fingerprint
-from tracking3d.benchmark.initial_masks import masks_for
-from tracking3d.benchmark.job import Job
-from tracking3d.benchmark.variant import Variant, check_masks, degraded_iou, noise_pixels
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import read_truth
-from tracking3d.datasets.truth import MaskFile
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.results.files import read_mask, write_mask
 from tracking3d.trackers.precomputed import PrecomputedMasks
 from tracking3d.video.image_file import read_image
+from tracking3d_bench.benchmark.fingerprint import masks_fingerprint
+from tracking3d_bench.benchmark.initial_masks import masks_for
+from tracking3d_bench.benchmark.job import Job
+from tracking3d_bench.benchmark.variant import Variant, check_masks, degraded_iou, noise_pixels
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.datasets.truth import MaskFile
 
 
 def test_a_changed_setting_is_the_only_change():

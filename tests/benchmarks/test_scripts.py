@@ -23,7 +23,7 @@ from soak import soak
 from split import split
 from split_benefit import SplitMeasurement, looped
 
-FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+FOLDER = Path(__file__).resolve().parents[2] / "plugins/tracking3d-bench/benchmarks"
 SCRIPTS = ("batch", "cost", "render", "same_answers", "schedule", "soak", "split")
 
 

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 from recorded_runs import write_run
 
-from tracking3d.datasets.clip import write_clip
 from tracking3d.geometry.camera import Camera
+from tracking3d.synthesis.convex_clips import write_clip
 
 BOX = "run clip --box 1,2,20,20 "
 MISTAKES = (

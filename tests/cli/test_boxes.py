@@ -14,13 +14,13 @@ from PIL import Image
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.one_video import track_video
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame
 from tracking3d.prompts.boxes import parse_box
 from tracking3d.prompts.corrections import Correction, parse_correction
 from tracking3d.prompts.prompt import PromptSet, make_prompt
-from tracking3d.vot.regions import prompt_of
+from tracking3d_bench.datasets.truth import Truth
+from tracking3d_bench.vot.regions import prompt_of
 
 VGA = Frame(0, np.zeros((360, 640, 3), np.uint8), name="000.png")
 

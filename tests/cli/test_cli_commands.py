@@ -319,7 +319,7 @@ def test_bad_question_for_points_is_refused(refused, finished, arguments, words)
 def test_bench_render_prints_the_benchmark(call, refused, monkeypatch):
     module = types.ModuleType("bench_render")
     module.benchmark = lambda *given, **named: {"given": given, **named}
-    monkeypatch.setitem(sys.modules, "tracking3d.speed.benchmark", module)
+    monkeypatch.setitem(sys.modules, "tracking3d_bench.speed.benchmark", module)
     options = ["--size", 64, "--frames", 2, "--channels", 8, "--repeats", 3, "--no-dense"]
     result = call("bench", "render", *options, "--json")
     given = [64, 2, 8, None, 3, 1, "cpu"]

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.benchmark import suite as suite_module
-from tracking3d.benchmark.pool import JobOutcome
-from tracking3d.benchmark.results import ResultSet, write_results
-from tracking3d.datasets.clip import write_clip
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d_bench.benchmark import suite as suite_module
+from tracking3d_bench.benchmark.pool import JobOutcome
+from tracking3d_bench.benchmark.results import ResultSet, write_results
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +83,7 @@ def test_a_fresh_suite_is_drawn_from_its_seed_and_kept_apart(call, clips, jobs, 
         asked.append((name, folder, specs and [spec.seed for spec in specs]))
         return made(clips)
 
-    monkeypatch.setattr("tracking3d.benchmark.sequences.make_suite", make)
+    monkeypatch.setattr("tracking3d_bench.benchmark.sequences.make_suite", make)
     for seed in (9000, 9001):
         fresh = ("evaluate", "suite", "fresh", "--seed", seed, "--count", 5, "--label", "mine")
         result = call(*fresh)
@@ -112,7 +111,7 @@ def test_only_the_sequences_that_match_are_run(call, clips, jobs, refused):
 
 def test_a_table_is_printed_and_written_in_three_formats(call, clips, jobs, monkeypatch):
     monkeypatch.setattr(
-        "tracking3d.benchmark.sequences.make_suite", lambda name, folder, **named: made(clips)
+        "tracking3d_bench.benchmark.sequences.make_suite", lambda name, folder, **named: made(clips)
     )
     arguments = ("evaluate", "table", "keyframes", "--data", clips, "--initial", f"ostrack={clips}")
     words = call(*arguments)  # the layout of CDTB finds nothing in clips of our own

@@ -11,14 +11,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.bop_export import write_bop
-from tracking3d.datasets.layout import load_layout
-from tracking3d.datasets.reading import list_sequences, read_sequence
-from tracking3d.datasets.truth import DepthFile, MaskFile, MeshFile, Truth
 from tracking3d.errors import InputError, OutputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import read_mask, write_image, write_mask
 from tracking3d.video import read_image
+from tracking3d_bench.datasets.bop_export import write_bop
+from tracking3d_bench.datasets.layout import load_layout
+from tracking3d_bench.datasets.reading import list_sequences, read_sequence
+from tracking3d_bench.datasets.truth import DepthFile, MaskFile, MeshFile, Truth
 
 SIZE = (40, 30)
 

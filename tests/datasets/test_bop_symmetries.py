@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from written_datasets import write_json
 
-from tracking3d.datasets.bop import read_symmetries
+from tracking3d_bench.datasets.bop import read_symmetries
 
 
 @pytest.fixture

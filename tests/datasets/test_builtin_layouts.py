@@ -21,12 +21,12 @@ from written_datasets import (
     write_palette,
 )
 
-from tracking3d.datasets.layout import builtin_layouts, load_layout
-from tracking3d.datasets.reading import list_sequences, read_sequence
 from tracking3d.errors import InputError
 from tracking3d.synthesis.convex_clips import make_demo_clip
 from tracking3d.trackers.vot_regions import encode_mask, format_region
 from tracking3d.video import read_image
+from tracking3d_bench.datasets.layout import builtin_layouts, load_layout
+from tracking3d_bench.datasets.reading import list_sequences, read_sequence
 
 
 def names(layout, root):

@@ -10,8 +10,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 from written_datasets import HEIGHT, WIDTH, rectangle, write_frames, write_grey, write_json, write_lines
 
-from tracking3d.datasets.frame_matching import match_frames, number_of
-from tracking3d.datasets.layout import (
+from tracking3d.errors import InputError
+from tracking3d.results.files import write_image
+from tracking3d_bench.datasets.frame_matching import match_frames, number_of
+from tracking3d_bench.datasets.layout import (
     DatasetLayout,
     Depth,
     Intrinsics,
@@ -24,9 +26,7 @@ from tracking3d.datasets.layout import (
     builtin_layouts,
     load_layout,
 )
-from tracking3d.datasets.reading import list_sequences, read_sequence
-from tracking3d.errors import InputError
-from tracking3d.results.files import write_image
+from tracking3d_bench.datasets.reading import list_sequences, read_sequence
 
 K = [50.0, 0, 15.5, 0, 51.0, 11.5, 0, 0, 1]
 
@@ -463,7 +463,8 @@ def test_a_sequence_without_any_truth_has_nothing_to_score(read):
 
 
 def test_the_documentation_names_every_description_and_key():
-    page = (Path(__file__).resolve().parents[2] / "benchmarks/datasets.md").read_text(encoding="utf-8")
+    pages = Path(__file__).resolve().parents[2] / "plugins/tracking3d-bench/benchmarks"
+    page = (pages / "datasets.md").read_text(encoding="utf-8")
     models = (
         DatasetLayout,
         Sequences,

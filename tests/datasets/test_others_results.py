@@ -12,7 +12,9 @@ from large_arrays import memory_stays_below, write_zeros
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.readers import (
+from tracking3d.errors import InputError
+from tracking3d.results.files import write_image, write_mask
+from tracking3d_bench.datasets.readers import (
     answers_from_bop_csv,
     answers_from_colmap,
     answers_from_masks,
@@ -21,9 +23,7 @@ from tracking3d.datasets.readers import (
     read_answers,
     recognise_format,
 )
-from tracking3d.datasets.truth import PointTruth, Truth
-from tracking3d.errors import InputError
-from tracking3d.results.files import write_image, write_mask
+from tracking3d_bench.datasets.truth import PointTruth, Truth
 
 SIZE = (32, 24)
 COUNT = 4

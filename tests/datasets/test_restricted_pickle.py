@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from tracking3d.datasets.readers.restricted_pickle import read_pickle
+from tracking3d_bench.datasets.readers.restricted_pickle import read_pickle
 
 FRAMES = np.arange(24).reshape(2, 3, 4)
 ARRAYS = {
@@ -106,7 +106,7 @@ FAR_AWAY = b"\x80\x04Nr\xff\xff\xff\x7f."
 READER = """
 import resource, sys
 from pathlib import Path
-from tracking3d.datasets.readers.restricted_pickle import read_pickle
+from tracking3d_bench.datasets.readers.restricted_pickle import read_pickle
 from tracking3d.errors import InputError
 used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 2**30,) * 2)

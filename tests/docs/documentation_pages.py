@@ -12,7 +12,7 @@ HOW_TO = sorted(ROOT.glob("docs/how-to/*.md"))
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *sorted(ROOT.glob("docs/**/*.md")),
-    *sorted(ROOT.glob("benchmarks/*.md")),
+    *sorted(ROOT.glob("plugins/tracking3d-bench/benchmarks/*.md")),
     *sorted(ROOT.glob("plugins/*/README.md")),
     *sorted(ROOT.glob("examples/**/*.md")),
 ]

@@ -15,7 +15,6 @@ from documentation_pages import PAGES, ROOT, commands, label
 from tracking3d.config.loading import list_presets, load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig, PaperConfig
-from tracking3d.evaluation.score import Scores
 from tracking3d.geometry.camera import Camera
 from tracking3d.picker.settings import TRACKER_FOR
 from tracking3d.pipeline.tracker_selection import CANDIDATES
@@ -23,6 +22,7 @@ from tracking3d.rendering import prepare_backend
 from tracking3d.results import layout
 from tracking3d.results.description import RunHeader, description_at_start, summary
 from tracking3d.results.records import FrameRecord
+from tracking3d_bench.evaluation.score import Scores
 
 
 def anchor(heading: str) -> str:
@@ -200,5 +200,5 @@ def test_run_folder_page_names_every_file_and_key():
 
 
 def test_measures_page_names_every_key():
-    page = (ROOT / "benchmarks/measures.md").read_text(encoding="utf-8")
+    page = (ROOT / "plugins/tracking3d-bench/benchmarks/measures.md").read_text(encoding="utf-8")
     assert [key for key in Scores.__dataclass_fields__ if f"`{key}`" not in page] == []

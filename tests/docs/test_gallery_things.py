@@ -13,8 +13,8 @@ import pytest
 import trimesh
 from documentation_pages import ROOT, commands
 
-from tracking3d.datasets.clip import read_truth
 from tracking3d.video.image_file import read_image
+from tracking3d_bench.datasets.clip import read_truth
 
 PAGE = ROOT / "docs/gallery.md"
 SCRIPT = ROOT / "docs/images/gallery_things.py"

@@ -13,9 +13,9 @@ from short_runs import estimate_of, frame, known_run, quick_solver, revised, run
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.paper.problem import Losses, Problem
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import MaskEstimate
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 PRESETS = pytest.mark.parametrize("preset", ["paper", "rerendering"])
 FAILS = {"tau": 1e-6}

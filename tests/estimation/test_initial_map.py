@@ -13,10 +13,10 @@ import trimesh
 from tracking3d.config.models import ObjectConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.prototype_start import RADIUS, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.mesh import Mesh
 from tracking3d.rendering import project, rasterize
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 CAMERA = Camera.from_fov(200, 160)
 

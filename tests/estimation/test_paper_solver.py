@@ -18,9 +18,9 @@ from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectMode
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.paper.problem import Losses
 from tracking3d.estimation.paper.solver import PaperSolver
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.rendering import render
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 PRESETS = pytest.mark.parametrize("preset", ["paper", "rerendering"])
 FAILS = {"tau": 1e-6}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.evaluation import model_scores
+from tracking3d_bench.evaluation import model_scores
 
 
 @pytest.fixture(autouse=True)

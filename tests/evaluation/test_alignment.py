@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.alignment import (
-    ObjectAlignment,
-    align_object_frame,
-    align_on_frame,
-    translation_errors,
-)
+from tracking3d.geometry.alignment import ObjectAlignment, align_object_frame
+from tracking3d_bench.evaluation.alignment import align_on_frame, translation_errors
 
 A = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 KNOWN = ObjectAlignment(A, 700.0, np.array([0.3, -0.5, 0.2]))

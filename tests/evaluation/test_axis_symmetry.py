@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.axis_symmetry import (
+from tracking3d_bench.evaluation.axis_symmetry import (
     aligned_axis_errors,
     anchored_axis_errors,
     consecutive_axis_errors,

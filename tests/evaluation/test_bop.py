@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.bop import (
+from tracking3d_bench.evaluation.bop import (
     THRESHOLDS,
     add,
     adi,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from tracking3d.evaluation.boundary import (
+from tracking3d_bench.evaluation.boundary import (
     SequenceStatistics,
     boundary_f,
     boundary_map,

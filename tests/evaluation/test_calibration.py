@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.evaluation.calibration import (
+from tracking3d_bench.evaluation.calibration import (
     Detection,
     detection_scores,
     expected_calibration_error,

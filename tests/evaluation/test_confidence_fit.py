@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error
-from tracking3d.evaluation.confidence_fit import as_python_source, fit_confidence, halves
+from tracking3d_bench.evaluation.calibration import area_under_roc, expected_calibration_error
+from tracking3d_bench.evaluation.confidence_fit import as_python_source, fit_confidence, halves
 
 
 def made(count, seed=0):

@@ -11,16 +11,17 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from turning_sphere import turning_sphere_of, written_run
 
-from tracking3d.datasets.clip import read_truth, write_clip
-from tracking3d.datasets.run_answers import answers_of_run
-from tracking3d.datasets.truth import PointTruth, Truth
-from tracking3d.evaluation.point_tracks import score_points
-from tracking3d.evaluation.score import Scores, score
-from tracking3d.evaluation.score_table import format_scores
 from tracking3d.results import layout
 from tracking3d.results.point_tracking import has_landmarks, open_scene
 from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import write_clip
 from tracking3d.video import open_source
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.datasets.run_answers import answers_of_run
+from tracking3d_bench.datasets.truth import PointTruth, Truth
+from tracking3d_bench.evaluation.point_tracks import score_points
+from tracking3d_bench.evaluation.score import Scores, score
+from tracking3d_bench.evaluation.score_table import format_scores
 
 FRAMES = 8
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.metrics import (
+from tracking3d.geometry.alignment import rotation_alignment
+from tracking3d_bench.evaluation.metrics import (
     aligned_rotation_errors,
     anchored_rotation_errors,
     consecutive_rotation_errors,
     mask_iou,
-    rotation_alignment,
     share_under,
 )
 

@@ -12,14 +12,15 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import read_truth, write_clip
-from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.errors import InputError
-from tracking3d.evaluation.mask_scores import MaskScores
-from tracking3d.evaluation.pose_scores import PoseScores
-from tracking3d.evaluation.score import Scores, score, score_run
-from tracking3d.evaluation.score_table import format_scores
 from tracking3d.geometry.camera import Camera
+from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.datasets.run_answers import answers_of_run, is_refined
+from tracking3d_bench.evaluation.mask_scores import MaskScores
+from tracking3d_bench.evaluation.pose_scores import PoseScores
+from tracking3d_bench.evaluation.score import Scores, score, score_run
+from tracking3d_bench.evaluation.score_table import format_scores
 
 FRAMES, WIDTH, HEIGHT = 10, 60, 40
 CAMERA = Camera.from_fov(WIDTH, HEIGHT)
@@ -470,7 +471,7 @@ def test_the_table_shows_the_figures_and_names_what_is_unknown(write_run, clip):
 
 
 def test_a_real_clip_scores_its_own_truth_perfectly(write_run, shared_data, tmp_path):
-    from tracking3d.datasets.clip import read_truth
+    from tracking3d_bench.datasets.clip import read_truth
 
     truth = read_truth(shared_data / "cube_in_hand")
     wanted = range(0, 164, 20)

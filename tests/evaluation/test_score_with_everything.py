@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("embreex", reason="the extra synth is not installed")
 
-from tracking3d.datasets.answers import Answers
-from tracking3d.datasets.clip import read_truth
-from tracking3d.evaluation.score import score
-from tracking3d.synthesis.spec import SequenceSpec
-from tracking3d.synthesis.writing import write_sequence
+from tracking3d_bench.datasets.answers import Answers
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.evaluation.score import score
+from tracking3d_bench.synthesis.spec import SequenceSpec
+from tracking3d_bench.synthesis.writing import write_sequence
 
 FRAMES = 6
 

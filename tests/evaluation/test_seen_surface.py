@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from tracking3d.evaluation.seen_surface import make_visibility_test
 from tracking3d.geometry.camera import Camera
+from tracking3d_bench.evaluation.seen_surface import make_visibility_test
 
 
 def test_a_frame_shows_the_front_of_a_ball_and_nothing_behind_another():

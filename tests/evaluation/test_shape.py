@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.alignment import ObjectAlignment
-from tracking3d.evaluation.shape import shape_scores
+from tracking3d.geometry.alignment import ObjectAlignment
+from tracking3d_bench.evaluation.shape import shape_scores
 
 SAMPLES = 10_000
 

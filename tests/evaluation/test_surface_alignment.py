@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.surface_alignment import align_surfaces
+from tracking3d_bench.evaluation.surface_alignment import align_surfaces
 
 
 def box():

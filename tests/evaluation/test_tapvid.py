@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.evaluation.tapvid import first_queries, strided_queries, tapvid_scores, to_tapvid_raster
+from tracking3d_bench.evaluation.tapvid import first_queries, strided_queries, tapvid_scores, to_tapvid_raster
 
 
 def queries(*frames):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tracking3d.evaluation.vot import (
+from tracking3d_bench.evaluation.vot import (
     LongTermSequence,
     confidence_thresholds,
     long_term_curves,

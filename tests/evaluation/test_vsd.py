@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.vsd import TOLERANCES, depth_to_distance, model_depth, vsd
+from tracking3d_bench.evaluation.vsd import TOLERANCES, depth_to_distance, model_depth, vsd
 
 K = np.array([[50.0, 0, 15.5], [0, 50, 11.5], [0, 0, 1]])
 SIZE = (32, 24)

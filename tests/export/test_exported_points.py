@@ -33,7 +33,7 @@ def test_tapvid_arrays_are_plain_and_in_its_coordinates(export, run):
 def test_tapvid_is_read_back_by_the_reader_of_others_results(export, run):
     from types import SimpleNamespace
 
-    from tracking3d.datasets.readers.tapvid import answers_from_tapvid
+    from tracking3d_bench.datasets.readers.tapvid import answers_from_tapvid
 
     path = export(run, "tapvid", "out.npz", frame=1, xy=((62.0, 44.0),))
     frames = [run.parent / "video" / f"{index:03d}.png" for index in range(7)]

@@ -12,12 +12,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.pose_files import read_matrix_lines
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import longest_side, visible_side
+from tracking3d_bench.datasets.pose_files import read_matrix_lines
 
 POSED = [0, 1, 3, 5, 6]
 """Frame 2 is lost, frame 4 was skipped."""

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tracking3d.datasets.region_files import read_regions
 from tracking3d.errors import InputError
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.run_reader import RunReader
+from tracking3d.trackers.region_files import read_regions
 from tracking3d.trackers.vot_regions import rasterise
 
 SIZE = (96, 128)

@@ -7,11 +7,11 @@ from importlib import resources
 import pytest
 import torch
 
-from tracking3d.benchmark.feature_encoders import build_encoders, painted_images
-from tracking3d.benchmark.matching import make_pairs, matching_scores
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.features.s2dnet import S2DNetEncoder
 from tracking3d.testing import check_encoder
+from tracking3d_bench.benchmark.feature_encoders import build_encoders, painted_images
+from tracking3d_bench.benchmark.matching import make_pairs, matching_scores
 
 
 @pytest.fixture(scope="module")

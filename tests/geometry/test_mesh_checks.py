@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from tracking3d.datasets.truth import MeshFile
 from tracking3d.errors import InputError
 from tracking3d.geometry import mesh_checks
 from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.geometry.prototypes import from_file
-from tracking3d.synthesis.mesh_files import load_solid
-from tracking3d.synthesis.spec import SequenceSpec
+from tracking3d_bench.datasets.truth import MeshFile
+from tracking3d_bench.synthesis.mesh_files import load_solid
+from tracking3d_bench.synthesis.spec import SequenceSpec
 
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FACES = "f 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"

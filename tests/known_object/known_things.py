@@ -12,9 +12,9 @@ from PIL import Image
 
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
-from tracking3d.synthesis.sequences import RenderedSequence, render_sequence
-from tracking3d.synthesis.solid import Solid
-from tracking3d.synthesis.spec import SequenceSpec
+from tracking3d_bench.synthesis.sequences import RenderedSequence, render_sequence
+from tracking3d_bench.synthesis.solid import Solid
+from tracking3d_bench.synthesis.spec import SequenceSpec
 
 
 def filmed(**more: Any) -> RenderedSequence:

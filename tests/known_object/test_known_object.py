@@ -13,9 +13,9 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.online.known_object import rendered_keyframes
 from tracking3d.estimation.online.known_object.solver import NOT_SEEN
 from tracking3d.estimation.tracker_feedback import RELOCALIZED
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.pipeline.known_object import read_known_object
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from resumable_runs import settings
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline import lost_frames, second_start
 from tracking3d.pipeline.gap_tracker import plan_gaps
@@ -23,6 +22,7 @@ from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES = 16
 

@@ -13,7 +13,6 @@ from resumable_runs import Stopped, assert_alike, settings, stop_at
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.gap import PhotoEstimates
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
 from tracking3d.results.files import write_image
@@ -21,6 +20,7 @@ from tracking3d.results.notes import notes_of_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 
 @cache

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 import tracking3d
-from tracking3d.evaluation.tapvid import tapvid_scores, to_tapvid_raster
 from tracking3d.points.image_following import follow_in_images
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.video import open_source, read_image
+from tracking3d_bench.evaluation.tapvid import tapvid_scores, to_tapvid_raster
 
 ASKED = 40
 CLIPS = pytest.mark.parametrize("clip", ["cube_in_hand", "box_in_hand"])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
-from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.points import landmark_adjustment
 from tracking3d.points.track_chaining import Chain

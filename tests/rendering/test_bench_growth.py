@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from tracking3d.cli import app
 from tracking3d.errors import InputError, OutputError
-from tracking3d.speed import benchmark as bench_render
-from tracking3d.speed import growth as bench_growth
-from tracking3d.speed.growth import exponent, measure_growth
-from tracking3d.speed.plot import check_plot, plot_growth
-from tracking3d.speed.scene import RenderWorkload
-from tracking3d.speed.table import format_growth
-from tracking3d.speed.timing import Duration
+from tracking3d_bench.speed import benchmark as bench_render
+from tracking3d_bench.speed import growth as bench_growth
+from tracking3d_bench.speed.growth import exponent, measure_growth
+from tracking3d_bench.speed.plot import check_plot, plot_growth
+from tracking3d_bench.speed.scene import RenderWorkload
+from tracking3d_bench.speed.table import format_growth
+from tracking3d_bench.speed.timing import Duration
 
 FEW = {
     "pixels": [{"size": size} for size in (16, 20, 24)],

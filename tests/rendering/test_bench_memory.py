@@ -12,8 +12,8 @@ import torch
 
 from tracking3d.runtime import memory
 from tracking3d.runtime.memory import resident_memory
-from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import RenderWorkload
+from tracking3d_bench.speed.memory import peak_memory
+from tracking3d_bench.speed.scene import RenderWorkload
 
 CPU = torch.device("cpu")
 needs_proc = pytest.mark.skipif(

@@ -12,12 +12,12 @@ from scenes import Textured, bumpy_sphere
 from tracking3d.errors import InputError
 from tracking3d.rendering import SoftBand, render
 from tracking3d.rendering.kernels import threads as kernels
-from tracking3d.speed import benchmark as bench_render
-from tracking3d.speed import timing as bench_timing
-from tracking3d.speed.benchmark import benchmark
-from tracking3d.speed.dense import render_dense
-from tracking3d.speed.scene import RenderScene, RenderWorkload, default_texture
-from tracking3d.speed.timing import backends, time_backends
+from tracking3d_bench.speed import benchmark as bench_render
+from tracking3d_bench.speed import timing as bench_timing
+from tracking3d_bench.speed.benchmark import benchmark
+from tracking3d_bench.speed.dense import render_dense
+from tracking3d_bench.speed.scene import RenderScene, RenderWorkload, default_texture
+from tracking3d_bench.speed.timing import backends, time_backends
 
 CPU = torch.device("cpu")
 SMALL = RenderWorkload(size=20, frames=2, channels=3, texture=24, frequency=3)
@@ -64,7 +64,7 @@ def test_the_dense_picture_and_its_gradients_are_the_renderers(scene: Textured, 
 def test_chunks_make_no_difference(monkeypatch):
     scene = bumpy_sphere((20, 20), frequency=3)
     whole = render_dense(faces=scene.faces, size=scene.size, **scene.arguments())
-    monkeypatch.setattr("tracking3d.speed.dense.CHUNK", 7 * len(scene.faces))
+    monkeypatch.setattr("tracking3d_bench.speed.dense.CHUNK", 7 * len(scene.faces))
     chunked = render_dense(faces=scene.faces, size=scene.size, **scene.arguments())
     assert torch.equal(whole.image(), chunked.image())
     assert torch.equal(whole.silhouette, chunked.silhouette)

@@ -13,9 +13,9 @@ import pytest
 
 import tracking3d
 from tracking3d.cli.progress import load_with_progress
+from tracking3d.runtime import kernels_ahead
+from tracking3d.runtime.kernels_ahead import compile_missing, compile_module, find_kernels, kernel_modules
 from tracking3d.runtime.progress import StageProgress, listen_to_progress
-from tracking3d.speed import kernels_ahead
-from tracking3d.speed.kernels_ahead import compile_missing, compile_module, find_kernels, kernel_modules
 
 PACKAGE = Path(tracking3d.__path__[0])
 SMALL = """

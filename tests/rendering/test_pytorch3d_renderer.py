@@ -18,9 +18,9 @@ from pytorch3d_renderer import ABSENT, render_pytorch3d, to_pytorch3d, why_no_py
 from render import render as render_script
 from script import as_program
 from tracking3d.rendering import SoftBand, render
-from tracking3d.speed import benchmark as bench_render
-from tracking3d.speed.scene import RenderScene, RenderWorkload
-from tracking3d.speed.timing import time_backends
+from tracking3d_bench.speed import benchmark as bench_render
+from tracking3d_bench.speed.scene import RenderScene, RenderWorkload
+from tracking3d_bench.speed.timing import time_backends
 
 CPU = torch.device("cpu")
 BAND = SoftBand(sigma=7000.0, boxlen=0.06)

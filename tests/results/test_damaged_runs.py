@@ -7,11 +7,11 @@ import shutil
 
 import pytest
 
-from tracking3d.datasets.run_answers import answers_of_run
-from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.results.correspondences import track_points
 from tracking3d.results.run_reader import RunReader
+from tracking3d_bench.datasets.run_answers import answers_of_run
+from tracking3d_bench.datasets.truth import Truth
 
 
 def read_everything(folder):

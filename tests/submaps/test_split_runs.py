@@ -11,7 +11,6 @@ import pytest
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.pipeline.record import record
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout
@@ -25,6 +24,7 @@ from tracking3d.submaps.plan import PARTS
 from tracking3d.submaps.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
 from tracking3d.video import open_source
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 LONG = 60
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from tracking3d.synthesis.camera_effects import compress, jpeg_quality
-from tracking3d.synthesis.occluder import MOST_HIDDEN
-from tracking3d.synthesis.sequences import render_sequence
-from tracking3d.synthesis.spec import Disturbances, SequenceSpec
 from tracking3d.video.image_file import read_image
+from tracking3d_bench.synthesis.camera_effects import compress, jpeg_quality
+from tracking3d_bench.synthesis.occluder import MOST_HIDDEN
+from tracking3d_bench.synthesis.sequences import render_sequence
+from tracking3d_bench.synthesis.spec import Disturbances, SequenceSpec
 
 QUICK = {"frames": 5, "size": (96, 72), "degrees_per_frame": 6.0, "seed": 7}
 

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from tracking3d.cli import app
 from tracking3d.errors import InputError
-from tracking3d.synthesis.fresh import OBJECTS, fresh_name, fresh_suite, seed_of
-from tracking3d.synthesis.pick_up import PICK_UP
-from tracking3d.synthesis.spec import Motion, SequenceSpec
-from tracking3d.synthesis.suite import load_suite
-from tracking3d.synthesis.writing import write_sequence
+from tracking3d_bench.synthesis.fresh import OBJECTS, fresh_name, fresh_suite, seed_of
+from tracking3d_bench.synthesis.pick_up import PICK_UP
+from tracking3d_bench.synthesis.spec import Motion, SequenceSpec
+from tracking3d_bench.synthesis.suite import load_suite
+from tracking3d_bench.synthesis.writing import write_sequence
 
 SEEDS = range(9000, 9012)
 
@@ -147,7 +147,7 @@ def test_the_command_makes_a_fresh_suite(call, tmp_path, monkeypatch, meshes):
         made.append(spec)
         folder.mkdir()
 
-    monkeypatch.setattr("tracking3d.synthesis.suite.write_sequence", write)
+    monkeypatch.setattr("tracking3d_bench.synthesis.suite.write_sequence", write)
     result = call("synth", "out", "--suite", "fresh", "--seed", 9000, "--count", 3, "--meshes", meshes)
     assert result.exit_code == 0 and result.stdout == "out: 3 sequences\n"
     assert made == fresh_suite(9000, 3, meshes)

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
-from tracking3d.synthesis.mask_degradation import Faults, degrade_to_iou
+from tracking3d_bench.evaluation.metrics import mask_iou
+from tracking3d_bench.synthesis.mask_degradation import Faults, degrade_to_iou
 
 NOTHING = Faults(wobble=0, leak=0, drift=0, parts=0, dropped=0)
 

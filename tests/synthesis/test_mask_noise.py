@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.synthesis.mask_noise import HAND_OFF, HAND_ON, boundary_distance, noisy_boundaries, with_hand
+from tracking3d_bench.synthesis.mask_noise import (
+    HAND_OFF,
+    HAND_ON,
+    boundary_distance,
+    noisy_boundaries,
+    with_hand,
+)
 
 FRAMES, SIZE, RADIUS = 60, 120, 30
 

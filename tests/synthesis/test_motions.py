@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.rigid import is_rigid
-from tracking3d.synthesis.motions import make_path
-from tracking3d.synthesis.pick_up import PICK_UP
-from tracking3d.synthesis.spec import Motion, SequenceSpec
+from tracking3d_bench.synthesis.motions import make_path
+from tracking3d_bench.synthesis.pick_up import PICK_UP
+from tracking3d_bench.synthesis.spec import Motion, SequenceSpec
 
 MOTIONS = [motion for motion in get_args(Motion) if motion != PICK_UP]  # test_phone_suites.py has that one
 CAMERA = Camera.from_fov(320, 240, 45.0)

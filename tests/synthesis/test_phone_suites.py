@@ -16,18 +16,18 @@ from typer.testing import CliRunner
 from tracking3d.cli import app
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
-from tracking3d.synthesis import tabletop
-from tracking3d.synthesis.camera_effects import linear
-from tracking3d.synthesis.frame_rendering import render_frame
-from tracking3d.synthesis.phone import phone_name, phone_seed, phone_suite
-from tracking3d.synthesis.pick_up import PICK_UP, Schedule, plan_pick_up
-from tracking3d.synthesis.pixel_rays import camera_to_pixels
-from tracking3d.synthesis.point_tracks import sample_point_tracks
-from tracking3d.synthesis.procedural_solids import make_procedural_solid
-from tracking3d.synthesis.scene import make_scene, make_solid
-from tracking3d.synthesis.spec import Disturbances, SequenceSpec, check_spec
-from tracking3d.synthesis.suite import load_suite
-from tracking3d.synthesis.writing import write_sequence
+from tracking3d_bench.synthesis import tabletop
+from tracking3d_bench.synthesis.camera_effects import linear
+from tracking3d_bench.synthesis.frame_rendering import render_frame
+from tracking3d_bench.synthesis.phone import phone_name, phone_seed, phone_suite
+from tracking3d_bench.synthesis.pick_up import PICK_UP, Schedule, plan_pick_up
+from tracking3d_bench.synthesis.pixel_rays import camera_to_pixels
+from tracking3d_bench.synthesis.point_tracks import sample_point_tracks
+from tracking3d_bench.synthesis.procedural_solids import make_procedural_solid
+from tracking3d_bench.synthesis.scene import make_scene, make_solid
+from tracking3d_bench.synthesis.spec import Disturbances, SequenceSpec, check_spec
+from tracking3d_bench.synthesis.suite import load_suite
+from tracking3d_bench.synthesis.writing import write_sequence
 
 SEEDS = (5, 9000)
 
@@ -283,7 +283,7 @@ def test_the_commands_know_the_suite(tmp_path, monkeypatch):
         folder.mkdir()
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tracking3d.synthesis.suite.write_sequence", write)
+    monkeypatch.setattr("tracking3d_bench.synthesis.suite.write_sequence", write)
     result = CliRunner().invoke(app, ["synth", "out", "--suite", "phone", "--seed", "5"])
     assert result.exit_code == 0 and result.stdout == "out: 12 sequences\n"
     assert made == phone_suite(5)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.ray_casting import RayMesh
+from tracking3d_bench.synthesis.ray_casting import RayMesh
 
 
 def rays(count=2000, seed=0):

@@ -15,11 +15,11 @@ from scipy.ndimage import (
 )
 from scipy.spatial import ConvexHull
 
-from tracking3d.synthesis.frame_rendering import render_frame
-from tracking3d.synthesis.scene import make_scene
-from tracking3d.synthesis.sequences import render_sequence
-from tracking3d.synthesis.spec import SequenceSpec
-from tracking3d.synthesis.texture_lookup import bilinear
+from tracking3d_bench.synthesis.frame_rendering import render_frame
+from tracking3d_bench.synthesis.scene import make_scene
+from tracking3d_bench.synthesis.sequences import render_sequence
+from tracking3d_bench.synthesis.spec import SequenceSpec
+from tracking3d_bench.synthesis.texture_lookup import bilinear
 
 QUICK = {"frames": 3, "size": (96, 72), "supersample": 1, "degrees_per_frame": 10.0, "seed": 5}
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis import room
-from tracking3d.synthesis.frame_rendering import render_frame
-from tracking3d.synthesis.lighting import lamp_at
-from tracking3d.synthesis.pixel_rays import camera_to_pixels, ray_directions
-from tracking3d.synthesis.room_rendering import room_light
-from tracking3d.synthesis.scene import make_scene
-from tracking3d.synthesis.spec import SequenceSpec, check_spec
+from tracking3d_bench.synthesis import room
+from tracking3d_bench.synthesis.frame_rendering import render_frame
+from tracking3d_bench.synthesis.lighting import lamp_at
+from tracking3d_bench.synthesis.pixel_rays import camera_to_pixels, ray_directions
+from tracking3d_bench.synthesis.room_rendering import room_light
+from tracking3d_bench.synthesis.scene import make_scene
+from tracking3d_bench.synthesis.spec import SequenceSpec, check_spec
 
 
 def walk(**settings) -> SequenceSpec:

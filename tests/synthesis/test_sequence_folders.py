@@ -11,13 +11,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError, OutputError
-from tracking3d.synthesis import writing
-from tracking3d.synthesis.sequences import render_sequence
-from tracking3d.synthesis.spec import SequenceSpec
-from tracking3d.synthesis.writing import SUITE_VERSION, is_complete, write_sequence
 from tracking3d.video.image_file import read_image
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.synthesis import writing
+from tracking3d_bench.synthesis.sequences import render_sequence
+from tracking3d_bench.synthesis.spec import SequenceSpec
+from tracking3d_bench.synthesis.writing import SUITE_VERSION, is_complete, write_sequence
 
 SPEC = SequenceSpec(
     object="box",

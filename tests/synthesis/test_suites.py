@@ -9,17 +9,17 @@ import pytest
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
-from tracking3d.datasets.clip import read_truth
-from tracking3d.datasets.layout import load_layout
-from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, OutputError
 from tracking3d.geometry.camera import Camera
-from tracking3d.synthesis import suite as suite_module
-from tracking3d.synthesis.frame_rendering import render_frame
-from tracking3d.synthesis.scene import make_scene
-from tracking3d.synthesis.spec import Disturbances, SequenceSpec, check_spec
-from tracking3d.synthesis.suite import SUITE_VERSION, SUITES, load_suite, make_suite
-from tracking3d.synthesis.writing import is_complete, write_sequence
+from tracking3d_bench.datasets.clip import read_truth
+from tracking3d_bench.datasets.layout import load_layout
+from tracking3d_bench.datasets.reading import read_sequence
+from tracking3d_bench.synthesis import suite as suite_module
+from tracking3d_bench.synthesis.frame_rendering import render_frame
+from tracking3d_bench.synthesis.scene import make_scene
+from tracking3d_bench.synthesis.spec import Disturbances, SequenceSpec, check_spec
+from tracking3d_bench.synthesis.suite import SUITE_VERSION, SUITES, load_suite, make_suite
+from tracking3d_bench.synthesis.writing import is_complete, write_sequence
 
 TINY = [
     SequenceSpec(name=name, object=name, frames=2, size=(32, 24), supersample=1)

@@ -9,12 +9,12 @@ from PIL import Image
 from scipy.spatial import Delaunay
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.procedural_solids import PROCEDURAL
-from tracking3d.synthesis.random_solids import _ASSEMBLIES
-from tracking3d.synthesis.ray_casting import RayMesh
-from tracking3d.synthesis.scene import make_solid
-from tracking3d.synthesis.spec import SequenceSpec
-from tracking3d.synthesis.texture_lookup import bilinear
+from tracking3d_bench.synthesis.procedural_solids import PROCEDURAL
+from tracking3d_bench.synthesis.random_solids import _ASSEMBLIES
+from tracking3d_bench.synthesis.ray_casting import RayMesh
+from tracking3d_bench.synthesis.scene import make_solid
+from tracking3d_bench.synthesis.spec import SequenceSpec
+from tracking3d_bench.synthesis.texture_lookup import bilinear
 
 
 def solid(name, **more):

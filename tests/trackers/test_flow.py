@@ -10,8 +10,6 @@ import pytest
 from moving_shape import SIZE, box_around, clutter, iou, moving_shape
 from pydantic import ValidationError
 
-from tracking3d.benchmark.mask_trackers import Contestant, measure_trackers
-from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
@@ -19,6 +17,8 @@ from tracking3d.geometry.camera import Window
 from tracking3d.testing import check_tracker
 from tracking3d.trackers.flow import FlowTracker
 from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker, Options
+from tracking3d_bench.benchmark.mask_trackers import Contestant, measure_trackers
+from tracking3d_bench.benchmark.sequences import open_dataset
 
 OFF = [
     {"prior": 0.0},

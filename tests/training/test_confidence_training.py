@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.benchmark.job import RUN, Job
-from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
-from tracking3d.datasets.clip import write_clip
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_mask
+from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d_bench.benchmark.job import RUN, Job
+from tracking3d_bench.benchmark.variant import Variant
 
 FRAMES = 12
 CAMERA = Camera.from_fov(32, 24)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from sample_objects import QUICK, sample_clip, write_frames
 
-from tracking3d.evaluation.metrics import mask_iou
-from tracking3d.vot.trax_server import main
+from tracking3d_bench.evaluation.metrics import mask_iou
+from tracking3d_bench.vot.trax_server import main
 
 Request = namedtuple("Request", ["type", "image", "objects"])
 

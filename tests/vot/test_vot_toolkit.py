@@ -37,19 +37,19 @@ def vot_test(workspace: Path, python: str, tracker: str, *options: str) -> str:
         f"""
 [python]
 protocol = python
-command = tracking3d.vot:VotTracker
+command = tracking3d_bench.vot:VotTracker
 timeout = 600
 convert = rectangle
 arg_overrides = {QUICK}
 
 [trax]
 protocol = trax
-command = {python} -m tracking3d.vot.trax_server --set "{QUICK}"
+command = {python} -m tracking3d_bench.vot.trax_server --set "{QUICK}"
 timeout = 600
 
 [wrong]
 protocol = python
-command = tracking3d.vot:VotTracker
+command = tracking3d_bench.vot:VotTracker
 arg_preset = no-such
 """
     )

@@ -9,11 +9,11 @@ import pytest
 from sample_objects import QUICK, sample_clip, write_frames
 
 from tracking3d.errors import InputError
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
-from tracking3d.vot import VotTracker
-from tracking3d.vot.regions import MaskRows, place_mask, prompt_of, rectangle_of
-from tracking3d.vot.sessions import configuration
+from tracking3d_bench.evaluation.metrics import mask_iou
+from tracking3d_bench.vot import VotTracker
+from tracking3d_bench.vot.regions import MaskRows, place_mask, prompt_of, rectangle_of
+from tracking3d_bench.vot.sessions import configuration
 
 
 @pytest.fixture(scope="module")

@@ -12,16 +12,14 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from tracking3d.batch.datasets import Dataset, dataset_reader
 from tracking3d.batch.one_video import LOGS
 from tracking3d.batch.rows import UnusableRow, VideoRow
 from tracking3d.batch.sidecar_files import videos_of
 from tracking3d.batch.storage import absolute, is_folder, local, parent
 from tracking3d.batch.tables import is_table, read_table
 from tracking3d.batch.video_job import VideoJob
-from tracking3d.benchmark.sequences import Dataset
 from tracking3d.config.models import PipelineConfig
-from tracking3d.datasets.layout import load_layout
-from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.pipeline.validation import needs_prompt
 from tracking3d.prompts.boxes import BoxFormat
@@ -84,7 +82,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     layout = str(Path(dataset.layout).absolute()) if Path(dataset.layout).is_file() else dataset.layout
     job = VideoJob(name, join_name(root, name), config, sequence=(layout, root, name))
     try:
-        truth = read_sequence(load_layout(layout), dataset.root, name)
+        truth = dataset_reader().read_sequence(layout, dataset.root, name)
         visible = truth.box_in_frame()
     except Tracking3dError as error:
         return replace(job, fault=str(error))

@@ -13,13 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tracking3d.batch.datasets import dataset_reader
 from tracking3d.batch.networks import SharedNetwork, keep_networks
 from tracking3d.batch.storage import absolute, copy_to_local, join_path, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
-from tracking3d.datasets.layout import load_layout
-from tracking3d.datasets.reading import read_sequence
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
@@ -200,7 +199,7 @@ def _source(job: VideoJob) -> FrameSource:
     if job.sequence is None:
         return open_source(job.video, job.frames)
     described, root, name = job.sequence
-    frames = read_sequence(load_layout(described), Path(root), name).frames
+    frames = dataset_reader().read_sequence(described, Path(root), name).frames
     return ImageSequence(name, frames, range(len(frames)))
 
 

@@ -1,6 +1,7 @@
 """The command line: parse, call, print.
 
-Each command has a file, and imports what it needs when it is called. So ``--help`` is quick.
+Each command has a file, and imports what it needs when it is called. So ``--help`` is quick. Other packages add
+commands of their own, see `tracking3d.cli.plugged_commands`.
 """
 
 from __future__ import annotations
@@ -11,13 +12,11 @@ import typer
 
 from tracking3d.cli import (
     batch,
-    bench,
     calibrate,
     compare,
     config,
     correct,
     demo,
-    evaluate,
     export,
     model,
     models,
@@ -26,7 +25,6 @@ from tracking3d.cli import (
     points,
     report,
     run,
-    synth,
     view,
 )
 from tracking3d.cli.options import Debug
@@ -41,7 +39,6 @@ app = typer.Typer(
 )
 app.command(name="run")(run.run)
 app.command(name="demo")(demo.demo)
-app.command(name="synth")(synth.synth)
 app.command(name="pick")(pick.pick)
 app.command(name="view")(view.view)
 app.command(name="correct")(correct.correct)
@@ -52,11 +49,9 @@ app.command(name="report")(report.report)
 app.command(name="compare")(compare.compare)
 app.add_typer(batch.app, name="batch")
 app.add_typer(calibrate.app, name="calibrate")
-app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(config.app, name="config")
-app.add_typer(bench.app, name="bench")
 
 
 def _print_version(wanted: bool) -> None:

@@ -35,8 +35,6 @@ def demo(
     from tracking3d.cli.tables import print_figures
 
     load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
-    from tracking3d.datasets.clip import read_truth
-    from tracking3d.evaluation.score import score_run
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import RecordOptions, record_tracking
     from tracking3d.prompts.prompt import PromptSet
@@ -51,17 +49,12 @@ def demo(
         source = open_source(clip / "frames")
         display.expect(plan_run(settings.model_dump(), source.count))
         options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
-        request = request_tracking(source, settings, PromptSet.of_one(read_truth(clip).box))
+        x, y, w, h = json.loads((clip / "init.json").read_text(encoding="utf-8"))["bbox_xywh"]
+        box = float(x), float(y), float(w), float(h)
+        request = request_tracking(source, settings, PromptSet.of_one(box))
         with report_at_end([folder]) as reporting:
             record_tracking(request, folder, options, reporting(display.show_frame))
-        scores = score_run(folder, clip)
-    summary = {
-        "iou_initial": scores.iou_initial_mean,
-        "iou": scores.iou_mean,
-        "rotation_error_mean_deg": scores.rotation_error_mean_deg,
-        "rotation_error_median_deg": scores.rotation_error_median_deg,
-        "seconds_per_frame": scores.seconds_per_frame,
-    }
+        summary = _score(folder, clip)
     write_atomic(out / "summary.json", json.dumps(summary, indent=2).encode() + b"\n")
     if not quiet:
         print_summary(folder)
@@ -70,3 +63,40 @@ def demo(
             f"Open {folder / REPORT} in a browser to see the frames, the 3D model, and which frames are uncertain.\n"
             "To track your own video: tracking3d pick VIDEO, or tracking3d run VIDEO --box X,Y,WIDTH,HEIGHT"
         )
+
+
+def _score(run_folder: Path, clip: Path) -> dict[str, float | None]:
+    """The figures of the demo: IoU without the frame that was prompted, rotations aligned by one rotation."""
+    import json
+
+    import numpy as np
+
+    from tracking3d.geometry.alignment import rotation_alignment, transposed_product
+    from tracking3d.results import layout
+    from tracking3d.results.description import time_per_frame
+    from tracking3d.results.files import read_mask
+    from tracking3d.results.records import mask_iou_or_none
+    from tracking3d.results.run_reader import RunReader
+
+    run = RunReader(run_folder)
+    truth = json.loads((clip / "poses.json").read_text(encoding="utf-8"))["frames"]
+    ious, rotations = [], []
+    for record in run.frames:
+        name = f"{record.index:06d}"
+        true = read_mask(clip / "masks" / f"{name}.png")
+        files = layout.initial_mask_path(run_folder, record.index), run.mask_path(record.index)
+        assert true is not None
+        if record is not run.frames[0]:
+            ious.append([mask_iou_or_none(true, read_mask(file)) or 0.0 for file in files])
+        rotations.append((record.T_cam_obj[:3, :3], truth[name]["R"]))
+    R_est, R_true = np.array(rotations, dtype=np.float64).swapaxes(0, 1)
+    A = rotation_alignment(R_est, R_true)
+    errors = np.degrees(transposed_product(R_est @ A, R_true).magnitude())
+    initial, final = (float(column.mean()) for column in np.array(ious).T)
+    return {
+        "iou_initial": initial,
+        "iou": final,
+        "rotation_error_mean_deg": float(errors.mean()),
+        "rotation_error_median_deg": float(np.median(errors)),
+        "seconds_per_frame": time_per_frame(run.description)[0],
+    }

@@ -1,4 +1,5 @@
-"""``tracking3d plugins``: list the installed mask trackers and feature encoders, or create a new one.
+"""``tracking3d plugins``: list the installed mask trackers, feature encoders and commands, or create a
+new plug-in.
 
 ``tracking3d plugins`` alone is short for ``tracking3d plugins list``.
 """
@@ -14,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug
+from tracking3d.cli.plugged_commands import COMMANDS, fault_of, registered_commands
 
 DEFAULT = "list"
 
@@ -34,7 +36,7 @@ def _with_command(args: list[str]) -> list[str]:
 
 app = typer.Typer(
     cls=_Plugins,
-    help="List the installed mask trackers and feature encoders, or create a new one.",
+    help="List the installed mask trackers, feature encoders and commands, or create a new plug-in.",
 )
 
 
@@ -50,13 +52,17 @@ def plugins(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """List the installed mask trackers and feature encoders, and say what is wrong with those that cannot run."""
+    """List the installed trackers, encoders and commands, and say what is wrong with those that cannot run."""
     import json
     from dataclasses import asdict
 
-    from tracking3d.plugins import list_plugins
+    from tracking3d.plugins import PluginInfo, list_plugins
 
     infos = list_plugins(build=True)
+    for name, point in sorted(registered_commands().items()):
+        package, version = (point.dist.name, point.dist.version) if point.dist else ("unknown", "")
+        fault = fault_of(point)
+        infos.append(PluginInfo(name, COMMANDS, package, version, "broken" if fault else "ok", fault))
     if as_json:
         typer.echo(json.dumps([asdict(info) for info in infos], indent=2))
         return

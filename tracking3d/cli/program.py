@@ -23,6 +23,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup, TyperOption
 
+from tracking3d.cli.plugged_commands import fault_of, plugged_command, registered_commands
 from tracking3d.errors import InputError, Tracking3dError
 
 INTERRUPTED = 130
@@ -65,6 +66,16 @@ class Program(TyperGroup):
             _print_nowhere()
         # On success --help and --version return 0, and the other commands None.
         sys.exit(code if isinstance(code, int) else 0)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """This package's commands, and those of others that can be loaded."""
+        own = super().list_commands(ctx)
+        others = (name for name, point in registered_commands().items() if not fault_of(point))
+        return [*own, *sorted(set(others).difference(own))]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command of this package, or else of another."""
+        return super().get_command(ctx, cmd_name) or plugged_command(cmd_name)
 
     def invoke(self, ctx: Any) -> Any:
         """Call the command; Ctrl-C or SIGTERM ends it, and its notes are printed."""

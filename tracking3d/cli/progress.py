@@ -187,7 +187,7 @@ def load_with_progress(module: str, quiet: bool, kernels: bool = False) -> None:
     with show_progress(quiet), collection_deferred():
         import_module(module)
         if kernels:
-            import_module("tracking3d.speed.kernels_ahead").compile_missing()
+            import_module("tracking3d.runtime.kernels_ahead").compile_missing()
 
 
 def _describe(frame: FrameRecord | SkippedFrame) -> str:

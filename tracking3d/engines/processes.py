@@ -36,7 +36,7 @@ PRELOADED = [
     "tracking3d.trackers.precomputed",
     "tracking3d.features.rgb",
     "tracking3d.batch.one_video",
-    "tracking3d.speed.kernels_loaded",
+    "tracking3d.runtime.kernels_loaded",
 ]
 """Modules that take seconds to import or to load; they are loaded once, before the first task."""
 

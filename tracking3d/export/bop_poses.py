@@ -10,9 +10,9 @@ import csv
 import math
 from pathlib import Path
 
-from tracking3d.datasets.readers.bop_csv import COLUMNS
 from tracking3d.export.exported_run import ExportedRun
 
+COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 MILLIMETRES = 1000.0
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.report.figures import angles_between, reliable_poses, stage_times, status_counts
 from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.metrics import rotation_alignment
+from tracking3d.geometry.alignment import rotation_alignment
 from tracking3d.geometry.similarity import Similarity
 
 Array = NDArray[np.float64]

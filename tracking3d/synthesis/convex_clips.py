@@ -6,6 +6,7 @@ mask if the ray through its centre meets the object. One `SyntheticSpec` always 
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import write_clip
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
-from tracking3d.results.files import write_mask, writing
+from tracking3d.results.files import write_atomic, write_image, write_mask, writing
 from tracking3d.runtime.progress import report_each
 from tracking3d.synthesis.convex_drawing import draw_convex
 from tracking3d.synthesis.convex_raycast import ConvexSurface, Ellipsoid, Polyhedron
 from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
+
+POSE_CONVENTION = "T_cam_obj: x_cam = R x_obj + t; OpenCV axes"
 
 SURFACES: dict[str, ConvexSurface] = {
     "box": Polyhedron.box((0.62, 0.48, 0.56)),
@@ -142,7 +144,7 @@ def degrade_masks(masks: NDArray[np.bool_], seed: int, pixels: float = 1.5) -> N
 def make_demo_clip(
     folder: Path, *, seed: int = 0, frames: int = 36, size: tuple[int, int] = (320, 240)
 ) -> Path:
-    """Write the clip of ``tracking3d demo`` in the layout of `tracking3d.datasets.clip`.
+    """Write the clip of ``tracking3d demo`` with its truth.
 
     Besides the exact ``masks/`` it holds ``rough_masks/``, the same with noise on their boundaries.
 
@@ -168,6 +170,52 @@ def make_demo_clip(
     for n, mask in enumerate(degrade_masks(clip.masks, seed)):
         write_mask(rough / f"{n:06d}.png", mask)
     return folder
+
+
+def write_clip(
+    folder: Path,
+    images: NDArray[np.uint8],
+    masks: NDArray[np.bool_],
+    T_cam_obj: NDArray[np.float64],
+    camera: Camera,
+    *,
+    source: str,
+    note: str,
+) -> None:
+    """Write a clip in full, frames as PNG.
+
+    Args:
+        folder: Made if absent; files of the same names are overwritten.
+        images: ``(N, H, W, 3)`` uint8 RGB.
+        masks: ``(N, H, W)`` bool.
+        T_cam_obj: ``(N, 4, 4)``.
+        camera: The camera of all frames.
+        source: Where the clip comes from.
+        note: Anything worth knowing.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    names = [f"{n:06d}" for n in range(len(images))]
+    poses = {
+        name: {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist(), "trusted": True}
+        for name, pose in zip(names, T_cam_obj, strict=True)
+    }
+    box = list(cv2.boundingRect(masks[0].astype(np.uint8)))
+    documents = {
+        "poses.json": {"convention": POSE_CONVENTION, "units": "object radii, about", "frames": poses},
+        "camera.json": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height},
+        "init.json": {"frame": 0, "bbox_xywh": box, "mask": f"masks/{names[0]}.png"},
+        "info.json": {"source": source, "frames": len(images), "note": note},
+    }
+    for part in ("frames", "masks"):
+        with writing(folder / part):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+    for name, image, mask in zip(names, images, masks, strict=True):
+        write_image(folder / "frames" / f"{name}.png", image)
+        write_mask(folder / "masks" / f"{name}.png", mask)
+    for file, document in documents.items():
+        write_atomic(folder / file, json.dumps(document, indent=1).encode() + b"\n")
 
 
 def _poses(spec: SyntheticSpec, camera: Camera, radius: float) -> NDArray[np.float64]:

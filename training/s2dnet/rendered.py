@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pairs import SHIFT, Pair
 from photometry import disturb
-from tracking3d.synthesis.camera_effects import linear
-from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.scene import make_scene
-from tracking3d.synthesis.spec import Disturbances, SequenceSpec
+from tracking3d_bench.synthesis.camera_effects import linear
+from tracking3d_bench.synthesis.frame_rendering import RenderedFrame, render_frame
+from tracking3d_bench.synthesis.scene import make_scene
+from tracking3d_bench.synthesis.spec import Disturbances, SequenceSpec
 
 Array = NDArray[np.float64]
 

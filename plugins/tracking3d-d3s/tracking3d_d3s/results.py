@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tracking3d.datasets.region_files import read_regions
-from tracking3d.datasets.region_tracker import RegionTracker
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.trackers.mask_files import UnreadableMaskError, open_masks
 from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.trackers.region_files import read_regions
+from tracking3d.trackers.region_tracker import RegionTracker
 from tracking3d.trackers.vot_regions import Rectangle, Region
 
 

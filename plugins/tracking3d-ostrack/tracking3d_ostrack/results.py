@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tracking3d.datasets.region_files import read_regions
-from tracking3d.datasets.region_tracker import RegionTracker
 from tracking3d.errors import InputError
 from tracking3d.trackers.mask_files import open_masks
 from tracking3d.trackers.precomputed import PrecomputedMasks
 from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.trackers.region_files import read_regions
+from tracking3d.trackers.region_tracker import RegionTracker
 
 
 def open_results(path: Path) -> MaskTracker:

@@ -12,10 +12,10 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d_bench.evaluation.metrics import Angles, aligned_rotation_errors
 
 FRAMES = 14
 Mask = NDArray[np.bool_] | None

@@ -30,11 +30,11 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import MaskAgreement
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FIRST, HIDDEN = 12, 3
 SECOND = range(30, 84)

@@ -15,9 +15,9 @@ from tracking3d.estimation.online import first_estimates, map_initialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.frames import Frame
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES, SOLVED = 20, 6
 """Frames of the clip, and those that the first map is made from, although all of them wait."""

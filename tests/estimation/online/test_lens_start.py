@@ -15,12 +15,12 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses, with_focal_length
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering import project
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES, FOV = 14, 12.0
 SOON = 6

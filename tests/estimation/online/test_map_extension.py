@@ -14,8 +14,8 @@ from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.geometry.pose import rotation_angle
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FIRST, LAST = 5, 8
 """The frames before and after these are unknown to the map."""

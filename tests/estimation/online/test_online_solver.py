@@ -27,9 +27,9 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.estimation.tracker_feedback import MOTION_RATIO, MOVES
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline.track import track
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 
 def overlaps(estimates):

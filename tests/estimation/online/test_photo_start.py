@@ -33,8 +33,8 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     match_photos,
     neighbouring_pairs,
 )
-from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 STEP = 20.0
 K = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])

@@ -12,8 +12,8 @@ from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
 from tracking3d.estimation.tracker_feedback import RELOCALIZED, corrects
-from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
+from tracking3d_bench.evaluation.metrics import mask_iou
 
 SHOWN = FRAMES - 3
 """The frame whose picture of the object comes back."""

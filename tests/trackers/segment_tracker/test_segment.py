@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.mask_trackers import Contestant, measure_trackers
-from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, Prompt
@@ -23,6 +21,8 @@ from tracking3d.trackers.segment.cue import NetworkCue, _settle
 from tracking3d.trackers.segment.network import ObjectNetwork
 from tracking3d.trackers.segment.tracker import SegmentTracker
 from tracking3d.video.image_file import read_image
+from tracking3d_bench.benchmark.mask_trackers import Contestant, measure_trackers
+from tracking3d_bench.benchmark.sequences import open_dataset
 
 
 def tracker(**options: object) -> SegmentTracker:

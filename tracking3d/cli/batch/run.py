@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.evaluate.options import Address, Sequences
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
+from tracking3d.cli.options.general import Sequences
 from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+from tracking3d.cli.options.performance import Address
 from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.errors import InputError
 
@@ -164,9 +165,9 @@ def run(
     if split is not None:
         _check_split(split, config, out, data, engine.address)
     if data is not None:
-        from tracking3d.benchmark.sequences import open_dataset
+        from tracking3d.batch.datasets import dataset_reader
 
-        videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
+        videos = dataset_jobs(dataset_reader().open_sequences(jobs, data, sequences or []), config)
     else:
         videos = list_jobs(
             jobs, lambda row: _build_config(row, settings, engine.threads), split or "", written

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options.panels import VIDEO
+from tracking3d.cli.options.panels import DATA, VIDEO
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
@@ -23,5 +23,14 @@ Video = Annotated[
         metavar="VIDEO",
         help="Path of the video, if it has moved since the run.",
         rich_help_panel=VIDEO,
+    ),
+]
+Sequences = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sequence",
+        metavar="PATTERN",
+        help="Use only sequences whose name matches; may be repeated.",
+        rich_help_panel=DATA,
     ),
 ]

@@ -39,6 +39,15 @@ Workers = Annotated[
     ),
 ]
 
+Address = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local to start Ray on this machine.",
+        rich_help_panel=PERFORMANCE,
+    ),
+]
+
 
 @dataclass(frozen=True)
 class PerformanceOptions:

@@ -1,0 +1,1 @@
+"""Measuring: datasets, scores, synthetic sequences, benchmarks, and the tracker for the VOT toolkit."""

@@ -1,0 +1,104 @@
+"""Modules that have moved are found under their former names for now, with a warning that names the present ones.
+
+What measures is a distribution of its own, ``tracking3d-bench``. Nothing in this package imports it: only who still
+imports a former name is led there.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import InspectLoader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import CodeType, ModuleType
+
+_ROOMS = {"benchmark", "datasets", "evaluation", "speed", "synthesis", "vot"}
+"""Of the package, whose modules are in ``tracking3d_bench`` now."""
+
+_ELSEWHERE = {
+    "tracking3d.datasets.region_files": "tracking3d.trackers.region_files",
+    "tracking3d.datasets.region_tracker": "tracking3d.trackers.region_tracker",
+    "tracking3d.speed.kernels_ahead": "tracking3d.runtime.kernels_ahead",
+}
+
+
+def bench_is_missing(what: str) -> str:
+    """A sentence for who asks for a part of the distribution ``tracking3d-bench`` without having it."""
+    return (
+        f"{what} is part of tracking3d-bench, which is not installed; in a clone of the repository run "
+        "`pip install -c constraints.txt ./plugins/tracking3d-bench`."
+    )
+
+
+class MovedModules(MetaPathFinder):
+    """Finds what no other finder does: modules of this package that have moved."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Where a former name leads; None for every other name."""
+        package, _, inside = fullname.partition(".")
+        room = inside.partition(".")[0]
+        if package != "tracking3d" or room not in _ROOMS:
+            return None
+        if inside == room and room != "vot":
+            return ModuleSpec(fullname, _FormerRoom(), is_package=True)
+        present = _ELSEWHERE.get(fullname, f"tracking3d_bench.{inside}")
+        # Trackers of the VOT toolkit are named in its users' files, who see no DeprecationWarning.
+        kind = FutureWarning if room == "vot" else DeprecationWarning
+        warnings.warn(f"{fullname} has moved: use {present}.", kind, stacklevel=2)
+        return ModuleSpec(fullname, _Moved(present))
+
+
+class _FormerRoom(InspectLoader):
+    """An empty package, whose modules `MovedModules` finds."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """There is nothing in it."""
+
+    def get_source(self, fullname: str) -> str:
+        """An empty text."""
+        return ""
+
+
+class _Moved(InspectLoader):
+    """Gives the module ``present`` under another name."""
+
+    def __init__(self, present: str) -> None:
+        self._present = present
+        self._own: ModuleSpec | None = None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """The module itself, not a second one."""
+        try:
+            module = import_module(self._present)
+        except ModuleNotFoundError as error:
+            if error.name != "tracking3d_bench":
+                raise
+            raise ModuleNotFoundError(bench_is_missing(spec.name), name=spec.name) from error
+        self._own = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """It has been executed; only its specification was replaced with that of the former name."""
+        module.__spec__ = self._own
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        """For ``python -m``."""
+        spec = find_spec(self._present)
+        return (
+            spec.loader.get_code(self._present) if spec and isinstance(spec.loader, InspectLoader) else None
+        )
+
+    def get_source(self, fullname: str) -> str | None:
+        """None: it is that of another module."""
+        return None
+
+
+def find_moved_modules() -> None:
+    """Let former names be imported from now on."""
+    if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
+        sys.meta_path.append(MovedModules())
