@@ -72,8 +72,8 @@ def commands(command, path: str = "tracking3d"):
     if not hasattr(command, "commands"):
         yield path, command
         return
-    for name, inner in command.commands.items():
-        yield from commands(inner, f"{path} {name}")
+    for name in command.list_commands(None):
+        yield from commands(command.get_command(None, name), f"{path} {name}")
 
 
 SHARED = {

@@ -10,10 +10,9 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import InspectLoader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
 from types import CodeType, ModuleType
+from typing import Any
 
 _ROOMS = {"benchmark", "datasets", "evaluation", "speed", "synthesis", "vot"}
 """Of the package, whose modules are in ``tracking3d_bench`` now."""
@@ -33,8 +32,11 @@ def bench_is_missing(what: str) -> str:
     )
 
 
-class MovedModules(MetaPathFinder):
-    """Finds what no other finder does: modules of this package that have moved."""
+class MovedModules:
+    """Finds what no other finder does: modules of this package that have moved.
+
+    It derives from nothing, and neither do the loaders: `importlib.abc` takes longer to import than this package.
+    """
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -45,26 +47,25 @@ class MovedModules(MetaPathFinder):
         if package != "tracking3d" or room not in _ROOMS:
             return None
         if inside == room and room != "vot":
-            return ModuleSpec(fullname, _FormerRoom(), is_package=True)
+            return ModuleSpec(fullname, _FormerRoom(), is_package=True)  # type: ignore[arg-type]
         present = _ELSEWHERE.get(fullname, f"tracking3d_bench.{inside}")
         # Trackers of the VOT toolkit are named in its users' files, who see no DeprecationWarning.
         kind = FutureWarning if room == "vot" else DeprecationWarning
         warnings.warn(f"{fullname} has moved: use {present}.", kind, stacklevel=2)
-        return ModuleSpec(fullname, _Moved(present))
+        return ModuleSpec(fullname, _Moved(present))  # type: ignore[arg-type]
 
 
-class _FormerRoom(InspectLoader):
+class _FormerRoom:
     """An empty package, whose modules `MovedModules` finds."""
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """As Python makes every module."""
 
     def exec_module(self, module: ModuleType) -> None:
         """There is nothing in it."""
 
-    def get_source(self, fullname: str) -> str:
-        """An empty text."""
-        return ""
 
-
-class _Moved(InspectLoader):
+class _Moved:
     """Gives the module ``present`` under another name."""
 
     def __init__(self, present: str) -> None:
@@ -88,14 +89,11 @@ class _Moved(InspectLoader):
 
     def get_code(self, fullname: str) -> CodeType | None:
         """For ``python -m``."""
-        spec = find_spec(self._present)
-        return (
-            spec.loader.get_code(self._present) if spec and isinstance(spec.loader, InspectLoader) else None
-        )
+        from importlib.util import find_spec
 
-    def get_source(self, fullname: str) -> str | None:
-        """None: it is that of another module."""
-        return None
+        spec = find_spec(self._present)
+        loader: Any = spec and spec.loader
+        return loader and loader.get_code(self._present)
 
 
 def find_moved_modules() -> None:

@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.export.bop_poses import COLUMNS
 from tracking3d.geometry.rigid import nearest_rigid
 from tracking3d_bench.datasets.answers import Answers
 from tracking3d_bench.datasets.readers.text_files import read_text
 from tracking3d_bench.datasets.truth import Truth
+
+COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+"""As `tracking3d.export.bop_poses` writes them, which takes longer to import."""
 
 
 @dataclass(frozen=True, eq=False)
