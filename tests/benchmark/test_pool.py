@@ -12,6 +12,7 @@ import pytest
 from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d_bench.benchmark import job as job_module
 from tracking3d_bench.benchmark import pool
+from tracking3d_bench.benchmark.fingerprint import hashed_sources
 from tracking3d_bench.benchmark.job import Job
 from tracking3d_bench.benchmark.pool import run_jobs
 
@@ -135,3 +136,10 @@ def test_the_camera_of_the_dataset_is_used_unless_the_settings_say_one(jobs, scr
 def test_a_job_survives_its_way_through_a_file(jobs, scripted):
     [one] = jobs(scripted(masks="truth"), ["wide"])
     assert Job.read(one.write()) == one
+
+
+def test_runs_are_found_again_for_the_same_package_and_scores_for_the_same_measures():
+    runs, scores = ({name for name, _ in hashed_sources(judges=judges)} for judges in (False, True))
+    assert {"estimation/estimate.py", "geometry/alignment.py", "config/presets/default.yaml"} <= runs
+    assert {"evaluation/score.py", "datasets/clip.py", "datasets/layouts/clip.yaml"} <= scores
+    assert not any(name.startswith(("cli/", "benchmark/", "speed/")) for name in runs | scores)

@@ -79,6 +79,21 @@ def test_an_earlier_version_is_the_one_that_runs_wherever_the_command_is_given(t
     assert told.stdout == "earlier\n"
 
 
+def test_an_earlier_version_has_its_own_entry_points(tmp_path):
+    (tmp_path / "tracking3d").mkdir()
+    (tmp_path / "tracking3d" / "__init__.py").write_text("")
+    (tmp_path / "tracking3d" / "__main__.py").write_text(
+        "from importlib import metadata\n"
+        "print([point.value for point in metadata.entry_points(group='tracking3d.trackers', name='csrt')])"
+    )
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\nname = "tracking3d"\nversion = "0.0.1"\n'
+        '[project.entry-points."tracking3d.trackers"]\ncsrt = "tracking3d.csrt:Tracker"\n'
+    )
+    told = track_speed._python(Contender("v0", package=tmp_path), "tracking3d")
+    assert told.stdout == "['tracking3d.csrt:Tracker']\n"
+
+
 def test_what_is_wrong_is_said_before_anything_runs(clips, tmp_path):
     for arguments in (["--plot", str(tmp_path / "a.txt")], ["--tracker", "nothing"], ["--set", "a.b=1"]):
         result = CliRunner().invoke(app, ["bench", "track", str(clips / "narrow"), *arguments])

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,12 +23,17 @@ from typing import Any
 
 import numpy as np
 
+import tracking3d
 from tracking3d.errors import InputError
 from tracking3d.results import layout
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.runtime.stage_times import STAGES, StageTimes
+from tracking3d_bench.benchmark.version_metadata import write_metadata
 from tracking3d_bench.datasets.truth import Truth
+
+CHECKOUT = Path(tracking3d.__file__).parents[1]
+"""The folder of this version's package."""
 
 PERCENTILES = (50, 95, 100)
 _POLL = 0.01  # seconds between looks at a file
@@ -139,18 +145,24 @@ def _first_line_in(file: Path) -> Iterator[list[float]]:
 
 def _compile_ahead(contender: Contender) -> None:
     """Compile its kernels, if its version can: a few frames do not use all of them."""
-    _python(contender, "tracking3d.runtime.kernels_ahead")
+    package = contender.package or CHECKOUT
+    room = (
+        "runtime" if (package / "tracking3d/runtime/kernels_ahead.py").is_file() else "speed"
+    )  # of earlier versions
+    _python(contender, f"tracking3d.{room}.kernels_ahead")
 
 
 def _python(contender: Contender, module: str, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a module of a contender's version."""
-    package = contender.package or Path(__file__).parents[2]
+    package = contender.package or CHECKOUT
     # How many threads linear algebra has is for each version to say, not for this one's command line.
-    environment = {**os.environ, "PYTHONPATH": str(package)}
+    environment = dict(os.environ)
     environment.pop("OPENBLAS_NUM_THREADS", None)
     # Without `-P` a package in the working directory would be taken, whatever version is asked for.
     command = [sys.executable, "-P", "-m", module, *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    with tempfile.TemporaryDirectory() as metadata:
+        environment["PYTHONPATH"] = os.pathsep.join([write_metadata(package, Path(metadata)), str(package)])
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def _parse_speed(
@@ -193,7 +205,7 @@ def check_out(tag: str, folder: Path) -> Path:
     Raises:
         InputError: If this package is not in a git checkout, or there is no such tag.
     """
-    root = Path(__file__).parents[2]
+    root = CHECKOUT
     command = ["git", "-C", str(root), "archive", "--format=tar", tag, "tracking3d", "pyproject.toml"]
     try:
         done = subprocess.run(command, capture_output=True, check=False)

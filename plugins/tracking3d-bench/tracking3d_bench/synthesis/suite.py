@@ -51,7 +51,7 @@ def load_suite(name: str) -> list[SequenceSpec]:
     if name not in SUITES:
         known = (*SUITES, *SEEDED)
         raise InputError(f"There is no suite '{name}'; {hint(name, known)}")
-    with resources.as_file(resources.files("tracking3d.synthesis") / "suites" / f"{name}.yaml") as file:
+    with resources.as_file(resources.files("tracking3d_bench.synthesis") / "suites" / f"{name}.yaml") as file:
         document = read_mapping(file)
     common = document.get("common", {})
     return [check_spec({**common, **one}, f"suite {name}") for one in document["sequences"]]
