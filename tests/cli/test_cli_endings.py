@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -90,6 +91,17 @@ def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
     assert kept == "The frames finished until then are in run."
     assert advice.startswith("To continue from there: tracking3d ") and advice.endswith(" --resume")
     assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit address space")
+def test_little_address_space_is_refused_before_a_library_that_is_loaded_ends_the_process(clip):
+    limited = f"ulimit -v 1800000 && exec {shlex.join([*PYTHON, 'run', str(clip), '--box', '20,10,20,20'])}"
+    done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: The process may use 1.8 GB of address space (ulimit -v), which is not enough memory; "
+        "allow 2.5 GB or more.\n"
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

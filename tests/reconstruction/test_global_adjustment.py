@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.geometry.alignment import align_object_frame
-from tracking3d.geometry.camera import LENS_KNOWN
+from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, LENS_KNOWN, Camera
 from tracking3d.points import landmark_adjustment
 from tracking3d.points.track_chaining import Chain
 from tracking3d.reconstruction import global_adjustment
@@ -116,17 +116,22 @@ def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_s
     assert rotation_errors(found).mean() < 0.5
 
 
-def test_a_lens_that_a_few_views_from_one_side_do_not_tell_stays_as_it_was_assumed():
-    longer = replace(CAMERA, fx=1.3 * CAMERA.fx, fy=1.3 * CAMERA.fy, assumed=True)
+@pytest.mark.parametrize("factor", [1.0, 1.3, 4.0], ids=["default", "of the first map", "far too long"])
+def test_a_lens_that_a_few_views_from_one_side_do_not_tell_is_the_default_one(factor):
+    default = Camera.from_fov(CAMERA.width, CAMERA.height)
+    first = replace(default.zoom(factor, "the likeliest of those tried"), assumed=True)
     true = np.stack([pose(yaw, 0.0) for yaw in (0.0, 3.0, 6.0, 9.0)])
     off = true.copy()
-    off[:, 2, 3] *= 1.3
-    look = GlobalAdjustment(ball(), longer, range(4), 20)
+    off[:, 2, 3] *= first.fy / CAMERA.fy
+    look = GlobalAdjustment(ball(), first, range(4), 20)
     for index, T in enumerate(true):
         look.see(answer(index, off[index]), *seen(T, pattern()))
     look.settle()
     assert look.camera.focal_deviation > LENS_KNOWN
-    assert look.camera == replace(longer, focal_deviation=look.camera.focal_deviation)
+    assert look.camera.fov == pytest.approx(DEFAULT_FIELD_OF_VIEW)
+    assert look.camera.assumed and look.camera.origin == "default field of view of 45 degrees"
+    moved, _ = look.pose(answer(3, off[3]), *seen(true[3], pattern()))
+    assert moved[2, 3] == pytest.approx(true[3, 2, 3] * default.fy / CAMERA.fy, rel=0.05)
 
 
 def test_a_lost_frame_is_not_looked_at_but_goes_on_from_the_view_before_to_the_one_after():

@@ -12,7 +12,7 @@ from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.moved_modules import bench_is_missing
 
-DATASETS = "tracking3d.datasets"
+DATASET_READERS = "tracking3d.dataset_readers"
 """Entry-point group of what reads datasets: the value of the entry point ``reader`` is a `DatasetReader`."""
 
 
@@ -86,7 +86,7 @@ def dataset_reader() -> DatasetReader:
     Raises:
         InputError: Nothing that does is installed.
     """
-    for point in metadata.entry_points(group=DATASETS, name="reader"):
+    for point in metadata.entry_points(group=DATASET_READERS, name="reader"):
         reader: DatasetReader = point.load()
         return reader
     raise InputError(bench_is_missing("What reads datasets"))

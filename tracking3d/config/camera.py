@@ -10,7 +10,7 @@ from tracking3d.calibration.calibrated_camera import CalibratedCamera, as_coeffi
 from tracking3d.calibration.camera_files import read_camera
 from tracking3d.config.models import CameraConfig
 from tracking3d.errors import InputError, argument
-from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
+from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, DEFAULT_ORIGIN, Camera
 from tracking3d.geometry.lens import Lens
 
 DISTORTION = argument("camera.distortion", "--distortion")
@@ -111,7 +111,7 @@ def _pinhole(
             _described(camera),
             known_origin,
         )
-    origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
+    origin = DEFAULT_ORIGIN
     return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)
 
 

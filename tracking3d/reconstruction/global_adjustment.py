@@ -7,6 +7,7 @@ the video, are bundled; every other one is resected from its neighbours among th
 
 from __future__ import annotations
 
+import math
 from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,12 +20,13 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.texture_strength import has_texture, texture_strength
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import DEFAULT_ORIGIN, LENS_KNOWN, Camera
 from tracking3d.points.landmark_adjustment import (
     LandmarkScene,
     LandmarkSupport,
     fit_outlines,
     is_supported,
+    refine_scene,
     refine_through,
 )
 from tracking3d.points.resection import resect
@@ -102,20 +104,33 @@ class GlobalAdjustment:
         self.vertices_of_landmarks = scene.vertices
         self._scene = fit_outlines(scene)
         self.vertices = self._scene.vertices
-        if scene.focal_factor != 1:
+        deviation = scene.focal_deviation
+        if deviation is not None and deviation > LENS_KNOWN:
+            self.camera = self.camera.zoom(scene.focal_factor, DEFAULT_ORIGIN)
+        elif scene.focal_factor != 1:
             self.camera = self.camera.with_solved_focal(scene.focal_factor)
-        if scene.focal_deviation is not None:
-            self.camera = replace(self.camera, focal_deviation=scene.focal_deviation)
+        if deviation is not None:
+            self.camera = replace(self.camera, focal_deviation=deviation)
 
     def _refine(self, most: int) -> LandmarkScene:
-        """The scene of at most so many views, spread evenly, as their landmarks have it."""
+        """The scene of at most so many views, spread evenly, as their landmarks have it.
+
+        Through a lens that they do not tell, whatever the first map took for the likeliest one, the default is used.
+        """
         there = sorted(self._views)
         at = np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).round().astype(int))
         self._bundled = [there[place] for place in at]
         views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         scene = LandmarkScene(views, self.vertices, self.faces, may_reverse=True)
-        return refine_through(scene, int(np.clip(_DRAWN // len(views), *ROUNDS)), self.camera)
+        rounds = int(np.clip(_DRAWN // len(views), *ROUNDS))
+        refined = refine_through(scene, rounds, self.camera)
+        deviation, factor = refined.focal_deviation, self.camera.default_factor
+        if deviation is None or deviation <= LENS_KNOWN or math.isclose(factor, 1):
+            return refined
+        poses = [_through_lens(self._views[index].T_cam_obj, factor) for index in self._bundled]
+        refined = refine_scene(scene.redrawn(self.vertices, dict(enumerate(poses)), factor), rounds)
+        return replace(refined, focal_deviation=deviation)
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
@@ -176,11 +191,14 @@ class GlobalAdjustment:
         return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LANDMARK_WINDOW)
 
     def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
-        """A pose of before as it is after what was done to all: the way round of depth, and the lens.
-
-        Through another lens the object has the same size.
-        """
+        """A pose of before as it is after what was done to all: the way round of depth, and the lens."""
         assert self._scene is not None
-        T = T_cam_obj.copy() if self._scene.reversal is None else self._scene.reversal.poses(T_cam_obj)
-        T[2, 3] *= self._scene.focal_factor
-        return T
+        T = T_cam_obj if self._scene.reversal is None else self._scene.reversal.poses(T_cam_obj)
+        return _through_lens(T, self._scene.focal_factor)
+
+
+def _through_lens(T_cam_obj: _Pose, focal_factor: float) -> _Pose:
+    """A pose as seen with another focal length, through which the object has the same size."""
+    T = T_cam_obj.copy()
+    T[2, 3] *= focal_factor
+    return T

@@ -15,7 +15,7 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, ObjectMode
 from tracking3d.results.description import for_new_folder
 from tracking3d.results.doubtful_frames import count_reasons
 from tracking3d.results.layout import has_state
-from tracking3d.results.notes import MOSTLY, is_lens_uncertain, unseen_share
+from tracking3d.results.notes import MOSTLY, advice_on_photos, is_lens_uncertain, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
@@ -103,13 +103,13 @@ def next_steps(run: RunReader, model: ObjectModel | None) -> list[Advice]:
         )
     reliable = 2 * _tracked(records) >= len(records)
     if not reliable:
-        steps.append(
-            Advice(
-                "For poses, film the object again: printed, or with a few stickers on it, larger in the picture, and "
-                "turned by some tens of degrees.",
-                (),
-            )
+        what = (
+            "For poses, film the object again: printed, or with a few stickers on it, larger in the picture, and "
+            "turned by some tens of degrees."
         )
+        if photos := advice_on_photos(run.description):
+            what = f"{photos[:1].upper()}{photos[1:]}."
+        steps.append(Advice(what, ()))
     if is_lens_uncertain(run.description["camera"]):
         steps.append(
             Advice("Give the camera's vertical field of view, if you know it.", (f"{again} --fov DEGREES",))

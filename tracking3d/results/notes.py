@@ -34,13 +34,18 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     """
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
     counted = (run.get("prompt") or {}).get("frames") is not None
-    advice = ((run.get("refinement") or {}).get("start") or {}).get("advice", "")
+    advice = advice_on_photos(run)
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
         *([advice] if advice else ()),
         *describe_camera_and_model(run["camera"], None if advice else model),
     ]
+
+
+def advice_on_photos(run: dict[str, Any]) -> str:
+    """Which photos of a set could not be joined, and what to do, as ``run.json`` has it; empty if all were."""
+    return ((run.get("refinement") or {}).get("start") or {}).get("advice", "")
 
 
 def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:

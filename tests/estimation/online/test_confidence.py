@@ -146,6 +146,7 @@ def test_the_reason_names_what_speaks_most_against_the_pose():
         "not been seen before": (replace(firm, unseen=0.6), PoseEvidence(400)),
         "too few inliers": (firm, PoseEvidence(0)),
         "hardly any texture": (firm, PoseEvidence(0, untextured=True)),
+        "no points that last": (firm, PoseEvidence(0, untextured=True, has_texture=True)),
         "too large": (replace(firm, points=0.9, overlap=0.8), PoseEvidence(100)),
         "rotation about camera axis (0.0, 1.0, 0.0)": (replace(loose, overlap=0.8), PoseEvidence(200)),
     }

@@ -157,6 +157,20 @@ def test_a_map_is_begun_again_only_if_that_is_clearly_better(monkeypatch) -> Non
     assert restart_without_points(astray, CAMERA, FitWeights()) is astray
 
 
+def test_a_map_that_hardly_turns_has_no_rival_and_is_begun_again_if_that_is_clearly_better(
+    monkeypatch,
+) -> None:
+    little = turned_map([0.0, 0.1, 0.2, 0.3, 0.4])
+
+    def off(object_map: ObjectMap, *_) -> tuple[ObjectMap, float]:
+        last = object_map.keyframes[-1].pose
+        return object_map, 1 + degrees_apart(last, little.keyframes[-1].pose)
+
+    monkeypatch.setattr(initial_map, "fit_jointly", off)
+    found = restart_without_points(map_astray(little), CAMERA, FitWeights())
+    assert degrees_apart(found.keyframes[-1].pose, little.keyframes[-1].pose) < 0.1
+
+
 @pytest.mark.slow
 def test_a_map_that_turns_the_wrong_way_is_begun_again() -> None:
     truth = turned_map([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0])

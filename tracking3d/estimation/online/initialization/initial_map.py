@@ -204,7 +204,7 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     as_it_is = replace(object_map, keyframes=_with_poses(chosen, present))
     ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
-    clear = cost < _CLEARLY_BETTER * min(before, *others)
+    clear = cost < _CLEARLY_BETTER * min([before, *others])
     return _without_points(found) if clear else object_map
 
 

@@ -21,7 +21,7 @@ from tracking3d.geometry.pose import Pose, pose_from_arrays
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
-_INITIAL_FIELDS_OF_VIEW = (OUTERMOST_LENSES[0], 16.0, 27.0, OUTERMOST_LENSES[1])  # besides the assumed one
+_INITIAL_FIELDS_OF_VIEW = (OUTERMOST_LENSES[0], 16.0, 27.0, 65.0)  # besides the assumed one
 _MIN_GAIN = 0.08  # relative gain required of twice or half the focal length; less for nearer ones
 _SAME_FOCAL_LENGTH = math.log(1.05)  # focal lengths within this ratio are the same
 _ITERATIONS = 25

@@ -55,6 +55,7 @@ class PoseEvidence:
         mask_weight: How far the mask is trusted, in [0, 1].
         has_mask: Whether there is one.
         untextured: Whether the object has no points that could be tracked.
+        has_texture: Whether it has texture nevertheless, whose points were not found again.
     """
 
     inliers: int
@@ -62,6 +63,7 @@ class PoseEvidence:
     mask_weight: float = 1.0
     has_mask: bool = True
     untextured: bool = False
+    has_texture: bool = False
 
     @property
     def is_decisive(self) -> bool:
@@ -259,6 +261,7 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
     best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
     worst = max(odds, key=lambda name: best[name] - odds[name])
     if worst == "inliers" and evidence.untextured:
-        return "the object has hardly any texture: its rotation is poorly constrained"
+        found = "no points that last" if evidence.has_texture else "hardly any texture"
+        return f"the object has {found}: its rotation is poorly constrained"
     axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)

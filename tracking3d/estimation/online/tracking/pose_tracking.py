@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.features.texture_strength import has_texture
 from tracking3d.estimation.online.mapping.local_mapping import is_well_inside, project_points, to_window
 from tracking3d.estimation.online.optimization.pnp import pose_from_points
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, refine_poses, render_cost
@@ -110,6 +112,7 @@ def pose_evidence(
         view.mask_weight,
         view.mask is not None,
         object_map.pointless,
+        has_texture([one.strength for one in object_map.keyframes if math.isfinite(one.strength)]),
     )
 
 
