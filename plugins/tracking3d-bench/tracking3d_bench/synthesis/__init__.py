@@ -1,0 +1,1 @@
+"""Synthetic sequences with exact truth: scenes, motions, lighting, and the suites made of them."""
