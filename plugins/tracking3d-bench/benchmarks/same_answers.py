@@ -25,7 +25,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+from tracking3d_bench.benchmark.version_metadata import write_metadata
+
+ROOT = Path(
+    subprocess.run(
+        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--show-toplevel"],
+        capture_output=True,
+        text=True,
+        check=False,
+    ).stdout.strip()
+    or Path(__file__).resolve().parents[3]
+)
 
 TOLERANCE = 1e-9
 """The largest difference of an entry of a pose that still counts as the same."""
@@ -63,9 +73,9 @@ class Version:
             raise SystemExit(f"{' '.join(words)} failed in {self.tree}:\n{ended.stderr[-4000:]}")
 
     def environment(self) -> dict[str, str]:
-        """What its processes see: its own modules first, and nothing that makes two runs of one version differ."""
+        """What its processes see: its own modules and entry points, and nothing that makes two of its runs differ."""
         return os.environ | {
-            "PYTHONPATH": str(self.tree),
+            "PYTHONPATH": write_metadata(self.tree, self.runs / ".metadata"),
             "OPENBLAS_NUM_THREADS": "1",
             # The last digits of IPP's distance transform depend on where in memory an image lies.
             "OPENCV_IPP": "disabled",

@@ -1,1 +1,1 @@
-"""Synthetic sequences with exact truth: scenes, motions, lighting, and the suites made of them."""
+"""Synthetic clips with exact ground truth, made by ray casting that shares no code with the renderer under test."""
