@@ -36,7 +36,7 @@ PIXELS = 400
 """Of a frame, at most; three in four of them near an outline."""
 _NEAR = 0.1
 _LEAST_OVERLAP = 0.4  # below with both masks, a frame is of something else
-_WEIGHTS = Path(__file__).resolve().parents[1] / "tracking3d" / "evidence" / "hindsight_weights.py"
+_WEIGHTS = Path(__file__).resolve().parents[1] / "tracking3d" / "segmentation" / "whole_video_weights.py"
 
 
 def answered_frames(run: RunReader, clip: Path) -> Iterator[Answered]:
@@ -149,7 +149,7 @@ def main(words: list[str]) -> None:
             print(f"fold {fold}: {share:.3f} of other sequences' pixels")
     weights = fitted(samples)
     lines = [f'    "{name}": {weight:.3f},' for name, weight in zip(names, weights, strict=True)]
-    head = '"""How much each source counts, by ``training/hindsight_masks.py``."""\n\nWEIGHTS = {\n'
+    head = '"""The weights of the whole-video features, fitted by ``training/hindsight_masks.py``."""\n\nWEIGHTS = {\n'
     _WEIGHTS.write_text(head + "\n".join(lines) + "\n}\n", encoding="utf-8")
 
 

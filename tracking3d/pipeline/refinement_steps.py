@@ -9,7 +9,7 @@ The steps are the same for any range of frames::
     settle_masks()                                     # what they have in common
     for frame in frames: decide(frame); rest()         # the mask of every frame
 
-A run in one process takes all frames through one `LastPasses`. `tracking3d.submaps.parallel_refinement` takes ranges of
+A run in one process takes all frames through one `RefinementSteps`. `tracking3d.submaps.parallel_refinement` takes ranges of
 frames through several, in processes of their own: what is adjusted together, and the masks that are collected, are done
 once.
 """
@@ -178,7 +178,7 @@ class RefinementSteps:
         yield from map(self._make_decision, self.masks.rest())
 
     def _segmentation_input(self, frame: Frame) -> Answered:
-        """A frame as `Hindsight` takes it: through a camera without lens distortion."""
+        """A frame as `VideoSegmenter` takes it: through a camera without lens distortion."""
         camera, record = self.look.camera, self._estimates.estimate(frame.index)
         mask, initial = self._estimates.mask(record), self._estimates.initial_mask(frame.index)
         occluder = self._estimates.occluder(frame.index)
