@@ -9,9 +9,9 @@ The steps are the same for any range of frames::
     settle_masks()                                     # what they have in common
     for frame in frames: decide(frame); rest()         # the mask of every frame
 
-A run in one process takes all frames through one `RefinementSteps`. `tracking3d.submaps.parallel_refinement` takes ranges of
-frames through several, in processes of their own: what is adjusted together, and the masks that are collected, are done
-once.
+A run in one process takes all frames through one `RefinementSteps`. `tracking3d.submaps.parallel_refinement` takes
+ranges of frames through several, in processes of their own: what is adjusted together, and the masks that are
+collected, are done once.
 """
 
 from __future__ import annotations
