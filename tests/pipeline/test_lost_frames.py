@@ -142,6 +142,7 @@ def test_a_run_in_which_hardly_a_frame_was_lost_is_refined_as_it_is(monkeypatch,
     run(video, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_explains_more(
     monkeypatch, tmp_path, video, caplog
 ):

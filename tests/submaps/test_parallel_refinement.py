@@ -28,7 +28,7 @@ from tracking3d.submaps.submap_runs import Revisit
 from tracking3d.synthesis.convex_clips import SyntheticSpec, degrade_masks, synthesize
 from tracking3d.video import open_source
 
-FRAMES = 26
+FRAMES = 18
 TIMES = {"seconds", "stages"}
 
 
@@ -71,7 +71,7 @@ def looked_at_again(frames: Path, config: PipelineConfig, folder: Path) -> Path:
 
 def ended_in_parts(frames: Path, config: PipelineConfig, folder: Path, cut: int) -> list[list[Step]]:
     """Go on with such a run in two parts; the steps that were taken, side by side."""
-    video = LongVideo(str(frames), config, folder, PromptSet(), "13f")
+    video = LongVideo(str(frames), config, folder, PromptSet(), "9f")
     begun = Begun(video, config, None, FRAMES, Plan([]), ())
     looks = tuple(
         Revisit(str(frames), None, selection, config, folder, PromptSet(), folder / "not needed any more")
@@ -109,7 +109,7 @@ def test_parts_come_to_what_one_process_comes_to(weighs, frames, tmp_path):
     before = {path.name: path.read_bytes() for path in (whole / layout.REFINING / layout.MASKS).iterdir()}
     parts = Path(shutil.copytree(whole, tmp_path / "parts"))
     record(open_source(str(frames)), config, whole, resume=True)
-    steps = ended_in_parts(frames, config, parts, cut=11)
+    steps = ended_in_parts(frames, config, parts, cut=8)
 
     assert [len(side_by_side) for side_by_side in steps] == ([1, 2, 1, 2, 1] if weighs else [1, 2, 1])
     assert RunReader(parts).state == RunReader(whole).state == "finished"

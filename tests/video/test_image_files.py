@@ -148,6 +148,30 @@ def test_a_turned_photo_has_its_principal_point_in_the_upright_picture(tmp_path:
     assert next(iter(source)).size == (400, 300)
 
 
+@pytest.mark.parametrize(
+    ("size", "orientation", "unit", "expected"),
+    [
+        ((640, 480), 1, 2, 5.40625 * 3106.8 / 25.4),
+        ((320, 240), 1, 2, 5.40625 * 3106.8 / 25.4 / 2),  # made smaller
+        ((480, 640), 1, 2, 5.40625 * 3106.8 / 25.4),  # turned by a program
+        ((640, 480), 6, 2, 5.40625 * 3106.8 / 25.4),
+        ((640, 480), 1, 3, 5.40625 * 3106.8 / 10),
+    ],
+)
+def test_without_a_35_mm_length_the_sensor_s_resolution_counts_for_the_size_that_the_file_has_now(
+    tmp_path, size, orientation, unit, expected
+) -> None:
+    exif = Pillow.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update(
+        {0x920A: 5.40625, 0xA20E: 3106.8, 0xA20F: 3106.8, 0xA210: unit, 0xA002: 640, 0xA003: 480}
+    )
+    Pillow.new("RGB", size).save(tmp_path / "1.jpg", exif=exif)
+    source = open_source(tmp_path)
+    assert source.intrinsics[0] == source.intrinsics[1] == pytest.approx(expected, rel=1e-4)
+    assert "5.40625 mm by the sensor's resolution" in source.intrinsics_origin
+
+
 @pytest.mark.parametrize("focal_length", [None, 0])
 def test_without_a_focal_length_there_is_no_camera(tmp_path: Path, focal_length: float | None) -> None:
     photo(tmp_path / "1.jpg", (400, 300), focal_length)

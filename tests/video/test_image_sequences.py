@@ -11,6 +11,7 @@ from PIL import Image as Pillow
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video import FrameSource, open_source
+from tracking3d.video.source import source_notes
 
 
 def save(path: Path, value: int = 0, size: tuple[int, int] = (12, 10)) -> None:
@@ -41,6 +42,49 @@ def test_a_folder_is_read_in_natural_order_without_foreign_files(folder: Path) -
     assert [frame.name for frame in frames] == [f"{number}.png" for number in range(12)]
     assert [int(frame.image.max()) for frame in frames] == list(range(12))
     assert all(frame.size == (10, 12) and frame.time is None for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("others", "left_out"),
+    [
+        (["texture.png"], "texture.png is left out, since most images here have other names"),
+        (
+            ["DSC_1.jpg", "DSC_22.JPG"],
+            "2 images such as DSC_1.jpg are left out, since most images here have other",
+        ),
+        (
+            [f"{number}.mask.png" for number in range(12)],
+            "12 images such as 0.mask.png are left out, since most",
+        ),
+        (
+            [f"{number:02}-depth.png" for number in range(20)],
+            "20 images such as 00-depth.png are left out: 16-bit grey",
+        ),
+    ],
+    ids=["one picture beside", "another camera", "as many masks", "more depths"],
+)
+def test_of_several_kinds_of_names_the_frames_are_taken_and_the_others_named(
+    folder, others, left_out
+) -> None:
+    for name in others:
+        kind = "I;16" if "depth" in name else "1" if "mask" in name else "RGB"
+        Pillow.new(kind, (12, 10)).save(folder / name)
+    source = open_source(folder)
+    assert [frame.name for frame in source] == [f"{number}.png" for number in range(12)]
+    [note] = source_notes(source)
+    assert note.startswith(left_out)
+    assert open_source(f"{folder}/[!.]*.*").count == 12 + len(others)
+
+
+def test_names_of_their_own_and_depths_alone_are_all_taken(tmp_path: Path) -> None:
+    for name in ("front", "back", "left side", "top", "IMG_1", "IMG_2"):
+        save(tmp_path / "words" / f"{name}.png")
+    assert open_source(tmp_path / "words").count == 6
+    (tmp_path / "deep").mkdir()
+    for name in ("a1", "b1", "b2"):
+        Pillow.new("I;16", (12, 10)).save(tmp_path / "deep" / f"{name}.png")
+    assert open_source(tmp_path / "deep").count == 3
+    assert source_notes(open_source(tmp_path / "deep")) == ()
 
 
 def test_a_source_of_files_can_be_read_again(folder: Path) -> None:

@@ -157,6 +157,13 @@ def test_a_run_whose_frames_are_gone_says_so(described):
     assert "from a camera" in RunCorrection(run, passed, None, Access()).why_not
 
 
+def test_the_viewer_of_a_run_whose_relative_video_has_moved_names_the_option_that_gives_it(described, caplog):
+    path = described / layout.RUN
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"source": "clips/gone.mp4"}))
+    open_viewer([described], Access(), port=0).close()
+    assert f"The video of the run {described} was not found; give its path as --source." in caplog.messages
+
+
 @pytest.mark.slow
 def test_a_person_draws_a_box_and_the_viewer_shows_how_it_goes(described, commands, tmp_path):
     write_run(tmp_path / "other", 12)

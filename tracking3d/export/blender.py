@@ -16,7 +16,7 @@ from PIL import Image as Pillow
 
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.geometry.camera import Camera
-from tracking3d.video.image_sequence import images_among
+from tracking3d.video.image_sequence import frames_among
 
 WORLD_FROM_CAMERA = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 """``(4, 4)``: camera axes x right, y down, z forward to Blender's world x right, y forward, z up."""
@@ -75,5 +75,5 @@ def _background(run: ExportedRun) -> str | None:
         return None
     source = Path(run.options.source or str(run.reader.description.get("source", "")))
     if source.is_dir():
-        return next((str(path.resolve()) for path in images_among(source.iterdir())), None)
+        return next((str(path.resolve()) for path in frames_among(source.iterdir())[0]), None)
     return str(source.resolve()) if source.is_file() else None

@@ -30,7 +30,9 @@ SUFFIXES = frozenset((
 # Named, because Pillow also takes text, vector and video formats for images, and runs programs for some.
 _FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TIFF", "GIF", "WEBP", "JPEG2000", "AVIF")
 
-_ORIENTATION, _EXIF, _FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405
+_ORIENTATION, _EXIF, _FOCAL_LENGTH_35MM, _FOCAL_LENGTH = 0x0112, 0x8769, 0xA405, 0x920A
+_WIDTH, _HEIGHT, _PIXELS_A_UNIT, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA210  # of the sensor, along x
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of that unit (Exif 2.32)
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 
@@ -59,24 +61,41 @@ def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
     """The pinhole camera that an image's EXIF data tell of, and in words where it came from.
 
     The 35 mm equivalent focal length is the one with the same *diagonal* field of view on a 36 x 24 mm frame
-    (CIPA DCG-001), so ``f = f35 * diagonal in pixels / 43.27``; the principal point is the centre.
+    (CIPA DCG-001), so ``f = f35 * diagonal in pixels / 43.27``. Without it, the focal length in mm counts with the
+    sensor's resolution, for the size that the file has now. The principal point is the centre.
 
     Returns:
         ``((fx, fy, cx, cy), origin)`` in pixels of the upright image, or None if the file does not tell.
     """
     try:
         with _open(path) as image:
-            focal_length = float(image.getexif().get_ifd(_EXIF).get(_FOCAL_LENGTH_35MM, 0))
+            told = image.getexif().get_ifd(_EXIF)
             width, height = image.size
             if _orientation(image) >= 5:
                 width, height = height, width
+            focal_length, how = float(told.get(_FOCAL_LENGTH_35MM, 0)), "in 35 mm terms"
+            f = focal_length * math.hypot(width, height) / _DIAGONAL_35MM
+            if not focal_length and _FOCAL_LENGTH in told and _PIXELS_A_UNIT in told:
+                focal_length, how = float(told[_FOCAL_LENGTH]), "by the sensor's resolution"
+                f = focal_length * float(told[_PIXELS_A_UNIT]) / _MILLIMETRES[told.get(_UNIT, 2)]
+                # Files are made smaller, and turned, by programs that leave the sensor's figures as they were.
+                taken = max(told.get(_WIDTH, 0), told.get(_HEIGHT, 0))
+                f *= max(width, height) / taken if taken else 1.0
     except Exception:  # None is fine here; read_image reports damaged files
         return None
-    if not 0 < focal_length < math.inf:
+    if not (0 < focal_length < math.inf and 0 < f < math.inf):
         return None
-    f = focal_length * math.hypot(width, height) / _DIAGONAL_35MM
-    origin = f"EXIF of {path.name}: focal length {focal_length:g} mm in 35 mm terms"
+    origin = f"EXIF of {path.name}: focal length {focal_length:g} mm {how}"
     return (f, f, (width - 1) / 2, (height - 1) / 2), origin
+
+
+def mode_of(path: Path) -> str:
+    """Pillow's word for a file's kind of pixels, such as RGB, L (grey) or I;16 (deep grey); empty if it is damaged."""
+    try:
+        with _open(path) as image:
+            return image.mode
+    except Exception:
+        return ""
 
 
 def is_still_image(path: Path) -> bool:

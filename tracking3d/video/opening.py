@@ -67,7 +67,7 @@ def _open_path(name: str, selection: range) -> FrameSource:
     if scheme_of(name) in SCHEMES:
         return open_stream(name, selection)
     found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
-    return ImageSequence.open(name, map(Path, found), selection)
+    return ImageSequence.open(name, map(Path, found), selection, chosen=True)
 
 
 def _open_file(name: str, path: Path, selection: range) -> VideoFile:

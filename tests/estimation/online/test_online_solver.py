@@ -249,7 +249,7 @@ def test_a_single_pixel_as_first_mask_is_no_traceback():
 def test_a_video_without_anything_to_follow_is_answered_with_its_masks():
     mask = np.zeros((60, 80), bool)
     mask[15:45, 20:50] = True
-    images = np.zeros((16, 60, 80, 3), np.uint8)
+    images = np.zeros((8, 60, 80, 3), np.uint8)
     estimates = list(
         track(images, mask=mask, config=load_config(overrides=["solver.tracker_feedback=false"]))
     )
