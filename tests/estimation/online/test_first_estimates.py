@@ -16,6 +16,7 @@ from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
+from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
@@ -62,7 +63,8 @@ def run_clip() -> Run:
 def largest_error(estimates) -> float:
     """Degrees of the worst rotation."""
     found = np.stack([estimate.T_cam_obj[:3, :3] for estimate in estimates])
-    return float(aligned_rotation_errors(found, clip().T_cam_obj[:, :3, :3]).max())
+    true = clip().T_cam_obj[[estimate.index for estimate in estimates], :3, :3]
+    return float(aligned_rotation_errors(found, true).max())
 
 
 @pytest.mark.usefixtures("late_start")
@@ -102,3 +104,39 @@ def test_without_them_the_last_frame_shows_hardly_a_landmark(monkeypatch):
     state, estimates = run_clip()
     assert state.object_map.keyframes[-1].index == SOLVED - 1
     assert estimates[-1].diagnostics["inliers"] < 5
+
+
+def test_earlier_frames_get_the_poses_of_a_map_that_is_begun_again(monkeypatch):
+    again = 16
+
+    def without_points(*given, **options) -> tuple[SolverState, InitialMap | None]:
+        state, start = try_initialize(*given, **options)
+        if start is None:
+            return state, None
+        return state, replace(start, object_map=replace(start.object_map, pointless=True))
+
+    def begun_again(state: SolverState, config: OnlineConfig) -> SolverState:
+        if state.last_pose[1] + 1 != again:
+            return state
+        assert state.repeatable
+        other = [replace(view, pose=exact(view.index, state)) for view in state.object_map.keyframes]
+        return replace(state, object_map=replace(state.object_map, keyframes=tuple(other)), repeatable=())
+
+    def exact(index: int, state: SolverState) -> Pose:
+        R = clip().T_cam_obj[index, :3, :3] @ clip().T_cam_obj[0, :3, :3].T
+        (own,) = (view.pose for view in state.object_map.keyframes if view.index == index)
+        return pose_from_arrays(R, own.translation.numpy(), state.object_map.vertices)
+
+    monkeypatch.setattr(map_initialization, "try_initialize", without_points)
+    monkeypatch.setattr(map_initialization, "restart_if_misfit", begun_again)
+    frames = [Frame(index, image) for index, image in enumerate(clip().images[: again + 2])]
+    state, _ = small_solver().init(frames[0], estimate_of(clip().masks[0]))
+    answers = []
+    for frame, mask in zip(frames[1:], clip().masks[1:], strict=False):
+        state, estimate = small_solver().step(state, frame, estimate_of(mask))
+        answers.append(estimate)
+    at_once, *later = answers[again - 1 :]
+    assert [one.index for one in at_once.revised] == list(range(again))
+    assert all(not one.revised for one in later)
+    assert state.repeatable == ()
+    assert largest_error(final(answers[again - 1 : again])) < 10

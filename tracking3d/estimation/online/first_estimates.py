@@ -10,7 +10,6 @@ import numpy as np
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, refine_local_map
 from tracking3d.estimation.online.masks.frame_estimates import learn_colours, make_estimate
@@ -31,7 +30,7 @@ _LAST = "last"  # name of the pose of the frame before, see `pose_predictions`
 def estimate_pending_frames(
     state: SolverState,
     waiting: tuple[tuple[Keyframe, FrameEstimate], ...],
-    start: InitialMap,
+    origin: str,
     before: Camera,
     config: OnlineConfig,
     weights: PoseWeights,
@@ -45,7 +44,7 @@ def estimate_pending_frames(
     Args:
         state: The state with the first map, as it was refined.
         waiting: The pending frames, and the estimates that they had.
-        start: The first map, as it was found.
+        origin: What the map was found from.
         before: The camera that the frames waited with.
         config: The solver's options.
         weights: Weights of a pose's cost terms.
@@ -55,10 +54,10 @@ def estimate_pending_frames(
     known = first.pose, first.index
     earlier = [one for one in waiting if one[0].index < first.index]
     state, backwards, _ = _estimate_in_turn(
-        state, earlier[::-1], known, poses, start.origin, before, config, weights
+        state, earlier[::-1], known, poses, origin, before, config, weights
     )
     state, revised, trail = _estimate_in_turn(
-        state, waiting[len(earlier) :], known, poses, start.origin, before, config, weights
+        state, waiting[len(earlier) :], known, poses, origin, before, config, weights
     )
     return replace(state, previous_pose=trail[-2]), [*backwards[::-1], *revised]
 

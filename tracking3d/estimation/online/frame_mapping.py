@@ -18,7 +18,7 @@ from tracking3d.estimation.online.masks.frame_estimates import initial_estimate,
 from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
 from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.state.confidence import is_high_loss, is_misfit
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import SolverState, thin_out
 from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import (
     TRAJECTORY_LENGTH,
@@ -79,6 +79,8 @@ class FrameMapping(ContinuedRefinement):
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated
         estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
+        if state.repeatable:
+            updated = replace(updated, repeatable=thin_out((*state.repeatable, (found.view, plain))))
         if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         if not (found.lost or is_keyframe):

@@ -13,7 +13,11 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.first_estimates import estimate_arrived_frames, estimate_pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
+from tracking3d.estimation.online.initialization.initializer import (
+    add_pending_frame,
+    restart_if_misfit,
+    try_initialize,
+)
 from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
@@ -28,6 +32,7 @@ from tracking3d.runtime.stage_times import in_stage
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
+_BEGUN_AGAIN = "begun again"  # what the first poses come from, see `FrameEstimate.hypothesis`
 _IN_PROGRESS = "the first map is being computed"
 Pending = tuple[Keyframe, FrameEstimate]
 """A frame that waits for the first map, and its estimate so far."""
@@ -97,17 +102,34 @@ class MapInitialization(MapExtension):
                 surface=object_map.surface(),
                 pending=None,
                 rested=(),
+                repeatable=waiting if start.object_map.pointless and not self.in_background else (),
             )
             updated = refine_by_landmarks(updated, self.online)
             if self.config.has_given_masks:
                 updated = measure_mask_agreement(updated)
             updated, revised = estimate_pending_frames(
-                updated, waiting, start, before, self.online, self.weights
+                updated, waiting, start.origin, before, self.online, self.weights
             )
         estimate = replace(revised[-1], revised=tuple(revised[:-1]))
         if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
             estimate = replace(estimate, reason=_LOOKS_FLAT)
         return updated, estimate
+
+    def _begin_again(self, state: SolverState) -> tuple[SolverState, tuple[FrameEstimate, ...]]:
+        """The state before the next frame, and new estimates of earlier ones if its map is begun again.
+
+        See `restart_if_misfit`. A live source would wait for seconds, so there it stays.
+        """
+        if self.in_background:
+            return state, ()
+        with in_stage("map"):
+            updated = restart_if_misfit(state, self.online)
+            if updated.object_map is state.object_map or not state.repeatable:
+                return updated, ()
+            updated, revised = estimate_pending_frames(
+                updated, state.repeatable, _BEGUN_AGAIN, state.camera, self.online, self.weights
+            )
+        return updated, tuple(revised)
 
     def _initialize_in_background(
         self, state: SolverState, newest: Pending

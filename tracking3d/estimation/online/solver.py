@@ -50,7 +50,6 @@ from tracking3d.estimation.online.atlas.reinitialization import (
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import restart_without_points
 from tracking3d.estimation.online.initialization.initializer import (
-    restart_if_misfit,
     try_initialize,
     why_no_map,
 )
@@ -148,11 +147,11 @@ class OnlineSolver(MapInitialization):
         frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
-        if not self.in_background:  # a live source would wait for seconds
-            state = restart_if_misfit(state, self.online)
+        state, revised = self._begin_again(state)
         state, estimate = self._track(state, frame, image, binary)
         if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)
+        estimate = replace(estimate, revised=(*revised, *estimate.revised))
         return state, mark_unaligned(estimate) if state.unaligned else estimate
 
     restart_backwards = staticmethod(restart_backwards)

@@ -29,7 +29,7 @@ from tracking3d.estimation.online.mapping.local_mapping import tracks_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import MOST_WAITING, SolverState, thin_out
 
 MOTION = 0.03
 """Image deformation at which an initialization is first tried, see `image_deformation`."""
@@ -38,7 +38,6 @@ _MOTION_AFTER_REST = 0.06
 tell little of its shape, and covers some of it."""
 _RETRY_FACTOR = 1.3  # factor by which the deformation must grow before the next attempt
 _MAX_BUNDLE_COST = 0.5  # bundle cost above which the points are not reliable: residuals of 0.8 pixels
-_MAX_PENDING = 40  # most pending frames
 _MIN_FRAMES = 4  # fewest frames of an initialization
 _MIN_FRAMES_WITHOUT_POINTS = 13
 _MAX_DEFORMATION = 0.15  # deformation that no initial map explains though it allows for half a turn
@@ -145,13 +144,13 @@ def try_initialize(
     shared = float(still_there.mean()) if len(still_there) else 0.0
     least = _MOTION_AFTER_REST if state.object_map.started_at_rest else MOTION
     # A textured object whose points keep their arrangement has not turned, however much covers it or moves with it.
-    if motion < least and not ended and (shared <= _MIN_SHARED or len(views) >= _MAX_PENDING):
+    if motion < least and not ended and (shared <= _MIN_SHARED or len(views) >= MOST_WAITING):
         state = replace(state, waiting_reason=_NOT_MOVED, ambiguous_frames=0)
         if shared <= _MIN_SHARED:
             return replace(state, pending=_recent_frames(waiting)), None
         at_rest = replace(state.object_map, started_at_rest=True)
         return replace(state, object_map=at_rest, pending=_subsample(waiting)), None
-    waited = ended or len(views) >= _MAX_PENDING
+    waited = ended or len(views) >= MOST_WAITING
     # Points that fail do not gain from more motion: pixels and outlines are used instead.
     wild = motion > _MAX_DEFORMATION and len(views) >= _MIN_FRAMES_WITHOUT_POINTS
     due = max(state.next_attempt, least)
@@ -233,7 +232,7 @@ def _start_without_points(
     """The initial map from pixels and outlines alone; None if nothing shows that the object rotates."""
     waiting = state.pending or ()
     if _last_still_view(views) is None:
-        kept = _subsample(waiting) if len(views) >= _MAX_PENDING else waiting
+        kept = _subsample(waiting) if len(views) >= MOST_WAITING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
     return state, initialize_without_points(
         state.object_map, state.camera, views, FitWeights(smoothness=config.smoothness)
@@ -254,7 +253,9 @@ def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
     known = state.object_map.fixed_keyframes > 0
     if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
         return state
-    state = replace(state, misfits=0, restarts=state.restarts + 1)
+    restarts = state.restarts + 1
+    again = state.repeatable if restarts < _MOST_RESTARTS else ()
+    state = replace(state, misfits=0, restarts=restarts, repeatable=again)
     weights = FitWeights(smoothness=config.smoothness)
     object_map = restart_without_points(state.object_map, state.camera, weights)
     if object_map is state.object_map:
@@ -278,9 +279,7 @@ def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
 def _set_aside(state: SolverState, first: int) -> SolverState:
     """The state whose first map is made without the pending frames before the one of index ``first``."""
     waiting = state.pending or ()
-    rested = (*state.rested, *(one for one in waiting if one[0].index < first))
-    while len(rested) > _MAX_PENDING:
-        rested = _subsample(rested)
+    rested = thin_out((*state.rested, *(one for one in waiting if one[0].index < first)))
     return replace(state, rested=rested, pending=tuple(one for one in waiting if one[0].index >= first))
 
 

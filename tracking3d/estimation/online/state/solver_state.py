@@ -24,6 +24,9 @@ from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
 
+MOST_WAITING = 40
+"""Most frames that are kept with their estimates because their poses may come or change later."""
+
 
 class SolverPhase(Enum):
     """What the solver does with the next frame."""
@@ -111,6 +114,8 @@ class SolverState:
         extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
             explain, by frame index.
         rested: Frames before the pending ones, in which the object did not turn yet; the first map gives them a pose.
+        repeatable: Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is begun again, they
+            are estimated again. Empty if it cannot be.
         background: The initialization that is computed in another thread, if there is one; see
             `tracking3d.estimation.online.map_initialization`.
     """
@@ -146,6 +151,7 @@ class SolverState:
     mask_agreement: MaskAgreement = MaskAgreement()
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    repeatable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
@@ -162,6 +168,15 @@ class SolverState:
         return replace(
             self, last_pose=(pose, index), previous_pose=self.last_pose, grey=grey, tracked_points=followed
         )
+
+
+def thin_out(
+    frames: tuple[tuple[Keyframe, FrameEstimate], ...],
+) -> tuple[tuple[Keyframe, FrameEstimate], ...]:
+    """At most `MOST_WAITING` of the frames: every second, with the first and the last, as long as there are more."""
+    while len(frames) > MOST_WAITING:
+        frames = (*frames[:-1:2], frames[-1])
+    return frames
 
 
 ONLINE_CLASSES = (
