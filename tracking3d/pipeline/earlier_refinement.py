@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,12 +48,6 @@ class EarlierRefinement:
     def shown(self) -> frozenset[int]:
         """Those and the frames in whose order of time they are looked at."""
         return self._around(2 * REACH)
-
-    @cached_property
-    def leading(self) -> frozenset[int]:
-        """The frames that stand and are each followed by one that has changed."""
-        order = sorted((*self.kept, *self.changed))
-        return frozenset(one for one, after in pairwise(order) if one in self.kept and after not in self.kept)
 
     def _around(self, reach: int) -> frozenset[int]:
         order = sorted((*self.kept, *self.changed))
