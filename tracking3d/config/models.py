@@ -168,8 +168,8 @@ class ObjectConfig(Section):
         gt=0,
         le=1,
         description=(
-            "With solver.final_refine: a tracked frame whose mask agrees by no more than this IoU with the initial "
-            "mask is estimated again. 1 estimates every frame again that has an initial mask."
+            "In the final refinement a mask that agrees by more than this IoU with the silhouette and the initial mask "
+            "is right: it need not be segmented again, nor its frame be estimated again. 1 does both in all frames."
         ),
     )
     texture_views: int = Field(

@@ -42,20 +42,12 @@ class EarlierRefinement:
     @cached_property
     def near(self) -> frozenset[int]:
         """The frames whose masks are decided again: those that changed, and those in whose motion cue they are."""
-        return self._around(REACH)
-
-    @cached_property
-    def shown(self) -> frozenset[int]:
-        """Those and the frames in whose order of time they are looked at."""
-        return self._around(2 * REACH)
-
-    def _around(self, reach: int) -> frozenset[int]:
         order = sorted((*self.kept, *self.changed))
         place = {index: at for at, index in enumerate(order)}
         return frozenset(
             order[at]
             for index in self.changed
-            for at in range(max(place[index] - reach, 0), min(place[index] + reach + 1, len(order)))
+            for at in range(max(place[index] - REACH, 0), min(place[index] + REACH + 1, len(order)))
         )
 
 

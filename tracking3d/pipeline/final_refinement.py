@@ -150,7 +150,7 @@ class FinalRefinement:
                 self._last.adjust_all()
             self._estimates.together += watch.times
             if self._session.config.object.segments_again:
-                self._last.begin_masks(self._session.config.has_given_masks)
+                self._last.begin_masks(self._session.config)
         self._writer.refine_camera(self._last.look.camera)
 
     def _write_precomputed(self, precomputed: PrecomputedRefinement) -> None:
@@ -165,7 +165,10 @@ class FinalRefinement:
     def passed_over(self) -> dict[str, int]:
         """How many frames each pass has left as they were, by its name."""
         again = self._last.retracked if self._precomputed is None else self._precomputed.retracked
-        return {"retracking": len(self._retracking.kept) - len(again)}
+        masks = self._last.masks
+        kept = 0 if masks is None else len(masks.kept)
+        kept = kept if self._precomputed is None else self._precomputed.kept_masks
+        return {"retracking": len(self._retracking.kept) - len(again), "masks": kept}
 
     @property
     def records(self) -> Iterable[FrameRecord]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.refined_start import LEAST_FRAMES, RefinedStart
@@ -53,12 +54,14 @@ class PrecomputedRefinement:
         estimates: The estimates with adjusted poses, by frame index.
         masks: The masks that were decided, as PNG, by index; their probabilities are written.
         retracked: The masks of frames that were estimated again after the adjustment, as PNG, by index.
+        kept_masks: Number of masks that were not segmented again because nothing contradicts them.
     """
 
     look: GlobalAdjustment
     estimates: Mapping[int, FrameRecord]
     masks: Mapping[int, bytes]
     retracked: Mapping[int, bytes]
+    kept_masks: int = 0
 
 
 class Retracking:
@@ -232,24 +235,25 @@ class RefinementSteps:
         agreement = None if window is None else mask_iou_or_none(window.answer, window.drawn)
         return (agreement or 0.0) <= self._retracking.least_agreement
 
-    def begin_masks(self, has_given_masks: bool) -> None:
+    def begin_masks(self, config: PipelineConfig) -> None:
         """Begin with the masks; which poses are reliable is taken from the estimates as they are now.
 
-        Args:
-            has_given_masks: Whether the user gives the initial masks.
+        Frames from before the first map, which were answered when it came, have their masks decided in any case, and
+        given masks decide what becomes of all.
         """
+        given = config.has_given_masks
+        may_keep = () if given else [one.index for one in self._estimates.causal.values() if not one.revision]
         known = {one.index: one.confidence for one in self._estimates.all() if _has_pose(one)}
         pinhole = replace(self.look.camera, lens=None)
         due = None if self._earlier is None else self._earlier.near
-        self.masks = VideoSegmenter(
-            pinhole, self.look.vertices_of_landmarks, self.look.faces, known, due, has_given_masks
-        )
+        surface = self.look.vertices_of_landmarks, self.look.faces
+        agreement = config.object.mask_agreement
+        self.masks = VideoSegmenter(pinhole, *surface, known, due, given, frozenset(may_keep), agreement)
 
     def collect_mask(self, frame: Frame) -> None:
         """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
-        if self.masks.wants(frame.index):
-            self.masks.see(self._segmentation_input(frame))
+        self.masks.see(self._segmentation_input(frame))
 
     def settle_masks(self) -> None:
         """All frames were collected: put together what their masks have in common."""
@@ -259,7 +263,7 @@ class RefinementSteps:
     def decide(self, frame: Frame) -> Iterator[Decision]:
         """Take the next frame, in order of time; gives those whose turn has come."""
         assert self.masks is not None
-        if self._earlier is not None and frame.index not in self._earlier.shown:
+        if not self.masks.needs(frame.index):
             yield from self.decide_rest()
             yield frame, None
             return

@@ -126,7 +126,7 @@ def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
     """
     estimates = _estimates(job.job.folder, job.look.camera)
     last = RefinementSteps(estimates, job.look)
-    last.begin_masks(job.job.config.has_given_masks)  # before poses are adjusted, as in one process
+    last.begin_masks(job.job.config)  # before poses are adjusted, as in one process
     for record in job.estimates.values():
         estimates.put(record, job.retracked.get(record.index))
     for frame in _frames(job.job.source, job.job.whole, estimates):

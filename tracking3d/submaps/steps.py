@@ -108,7 +108,8 @@ def _refine_in_parallel(
     ]
     pictures = {index: mask for part in decided for index, mask in part.items()}
     masks_took = time.monotonic() - clock
-    return PrecomputedRefinement(look, estimates, pictures, retracked), {**seconds, "masks": masks_took}
+    precomputed = PrecomputedRefinement(look, estimates, pictures, retracked, len(masks.kept))
+    return precomputed, {**seconds, "masks": masks_took}
 
 
 def _frames(job: PartJob | Revisit) -> int:
