@@ -42,6 +42,9 @@ class ContinuingSolver(StandInSolver):
         self.kept.append(frame.index)
         return state
 
+    def keyframe_poses(self, state: int) -> dict[int, np.ndarray]:
+        return {}
+
 
 @pytest.fixture(scope="module")
 def clip() -> SyntheticClip:

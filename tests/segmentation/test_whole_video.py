@@ -89,6 +89,38 @@ def test_frames_decided_side_by_side_are_the_same_to_the_last_digit(monkeypatch)
         np.testing.assert_array_equal(masks[0][index], masks[1][index])
 
 
+def test_only_masks_that_something_contradicts_are_decided_where_masks_may_be_kept():
+    frames = [
+        answered(0),  # from before the first map
+        answered(1),
+        answered(2, with_strip),  # the silhouette says otherwise
+        replace(answered(3), initial=with_strip(frame(3)[1])),  # the mask tracker says otherwise
+        replace(answered(4), initial=frame(4)[1] & False),
+        *(answered(number) for number in range(5, 12)),
+    ]
+    known = VideoSegmenter(
+        CAMERA, VERTICES, FACES, {one.index: 0.9 for one in frames}, may_keep=range(1, 12), agreement=0.95
+    )
+    for one in frames:
+        known.see(one)
+    known.settle()
+    assert known.kept == {1, *range(4, 12)}
+    assert [index for index in range(12) if known.needs(index)] == list(range(12))  # they tell the motion
+    found = dict(segment_all(known, frames))
+    assert {index for index, decided in found.items() if decided is not None} == {0, 2, 3}
+
+
+def test_frames_far_from_all_that_are_decided_are_not_needed():
+    frames = [answered(number % 12, index=number) for number in range(30)]
+    known = VideoSegmenter(
+        CAMERA, VERTICES, FACES, {one.index: 0.9 for one in frames}, may_keep=range(1, 30), agreement=0.95
+    )
+    for one in frames:
+        known.see(one)
+    known.settle()
+    assert [index for index in range(30) if known.needs(index)] == list(range(9))
+
+
 def test_a_frame_of_a_doubted_pose_keeps_its_mask():
     frames = [answered(number, with_strip, confidence=0.15 if number == 6 else 0.9) for number in range(12)]
     found = looked_at(frames)

@@ -15,6 +15,10 @@ from tracking3d.config.solvers import OnlineConfig, SolverConfig
 
 LARGEST_OBJECT = 1e6
 """Metres that an object's longest side may have; chosen."""
+RETRACK_ANGLE = 0.75
+"""Degrees; measured on box_in_hand and cube_in_hand."""
+MASK_AGREEMENT = 0.97
+"""IoU; measured on box_in_hand and cube_in_hand."""
 AUTO = "auto"
 """Name of the mask tracker that stands for the best one at hand, see `tracking3d.pipeline.tracker_selection`."""
 
@@ -137,6 +141,14 @@ class ObjectConfig(Section):
             "switches the adjustment off."
         ),
     )
+    retrack_angle: float = Field(
+        RETRACK_ANGLE,
+        ge=0,
+        description=(
+            "With solver.final_refine: a tracked frame keeps its causal estimate if the final bundle adjustment moves "
+            "its pose by at most so many degrees against the other frames. 0 estimates every frame again."
+        ),
+    )
     trust_masks: bool = Field(
         False,
         description=(
@@ -149,6 +161,15 @@ class ObjectConfig(Section):
         description=(
             "Segment every frame again at the end of the final refinement, from shape, colour and motion in all frames "
             "together. With trust_masks nothing is segmented again."
+        ),
+    )
+    mask_agreement: float = Field(
+        MASK_AGREEMENT,
+        gt=0,
+        le=1,
+        description=(
+            "In the final refinement a mask that agrees by more than this IoU with the silhouette and the initial mask "
+            "is right: it need not be segmented again, nor its frame be estimated again. 1 does both in all frames."
         ),
     )
     texture_views: int = Field(

@@ -93,6 +93,11 @@ class ContinuingSolver(Protocol, Generic[State]):
         """Take a frame whose refined pose ``(4, 4)`` stands, before ``refine_frame`` takes the next one."""
         ...
 
+    def keyframe_poses(self, state: State) -> Mapping[int, NDArray[np.float64]]:
+        """Refined poses ``(4, 4)`` of the keyframes after ``refine``, by frame index; none if they do not tell how the
+        refinement moved the causal poses."""
+        ...
+
 
 @runtime_checkable
 class ExtendingSolver(Protocol, Generic[State]):

@@ -128,6 +128,11 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         kept: State = self._solver.keep_frame(state, self._frame(frame), T_cam_obj)
         return kept
 
+    def keyframe_poses(self, state: State) -> Mapping[int, NDArray[np.float64]]:
+        """See `ContinuingSolver.keyframe_poses`."""
+        continuing = isinstance(self._solver, ContinuingSolver)
+        return self._solver.keyframe_poses(state) if continuing else {}
+
     def begin_extension(
         self, state: State, confidence: Mapping[int, float]
     ) -> tuple[State, ModelCoverage] | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,26 +42,12 @@ class EarlierRefinement:
     @cached_property
     def near(self) -> frozenset[int]:
         """The frames whose masks are decided again: those that changed, and those in whose motion cue they are."""
-        return self._around(REACH)
-
-    @cached_property
-    def shown(self) -> frozenset[int]:
-        """Those and the frames in whose order of time they are looked at."""
-        return self._around(2 * REACH)
-
-    @cached_property
-    def leading(self) -> frozenset[int]:
-        """The frames that stand and are each followed by one that has changed."""
-        order = sorted((*self.kept, *self.changed))
-        return frozenset(one for one, after in pairwise(order) if one in self.kept and after not in self.kept)
-
-    def _around(self, reach: int) -> frozenset[int]:
         order = sorted((*self.kept, *self.changed))
         place = {index: at for at, index in enumerate(order)}
         return frozenset(
             order[at]
             for index in self.changed
-            for at in range(max(place[index] - reach, 0), min(place[index] + reach + 1, len(order)))
+            for at in range(max(place[index] - REACH, 0), min(place[index] + REACH + 1, len(order)))
         )
 
 

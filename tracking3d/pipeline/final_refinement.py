@@ -19,7 +19,7 @@ from tracking3d.pipeline.refinement_steps import (
     Decision,
     PrecomputedRefinement,
     RefinementSteps,
-    estimate_again,
+    Retracking,
 )
 from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.reconstruction import TextureView, keep_best_views, texture_view
@@ -61,7 +61,7 @@ class FinalRefinement:
         earlier: EarlierRefinement | None = None,
     ) -> None:
         self._session, self._writer, self._estimates = tracked.session, writer, estimates
-        self._state, self._work, self._masks = state, work, masks
+        self._state, self._work = state, work
         self._views: tuple[TextureView, ...] = ()
         self._precomputed, self._earlier = precomputed, earlier
         wanted, camera = self._session.config.object, self._session.camera
@@ -73,7 +73,10 @@ class FinalRefinement:
         else:
             causal = sorted(estimates.causal)
             look = GlobalAdjustment(self._session.result(), camera, causal, wanted.adjustment_views)
-        self._last = RefinementSteps(estimates, look, fixed=tracked.corrections, earlier=earlier)
+        self._retracking = Retracking(self._session, masks, earlier)
+        self._last = RefinementSteps(
+            estimates, look, fixed=tracked.corrections, earlier=earlier, retracking=self._retracking
+        )
 
     @property
     def frames_again(self) -> frozenset[int]:
@@ -87,17 +90,17 @@ class FinalRefinement:
         if frame.index not in estimates.causal:
             return None
         if earlier is not None and (record := earlier.kept.get(frame.index)) is not None:
-            if frame.index in earlier.leading:
-                self._session.keep_frame(frame, record.T_cam_obj)
+            self._retracking.pass_over(frame, record.T_cam_obj)
             return self._work.do(partial(self._keep, record, frame, earlier.folder))
         if state.kept:
             check_picture(state.kept, frame)
             if frame.index <= state.before.last_refined:
                 record = estimates.estimate(frame.index)
                 return self._work.do(partial(self._collect, record, frame, estimates.mask(record)))
-        mask = estimates.initial_mask(frame.index)
-        initial = self._masks.estimate(frame.index, mask)
-        estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial, earlier)
+        if (record := self._retracking.keep(frame.index)) is not None:
+            self._retracking.pass_over(frame, record.T_cam_obj)
+            return self._work.do(partial(self._keep, record, frame, self._writer.folder))
+        estimate, mask = self._retracking.take(frame), estimates.initial_mask(frame.index)
         # A stopped refinement of some frames is begun again.
         kept = self._session.state_dict() if state.checkpoint and earlier is None else {}
         return self._work.do(partial(self._write_refined, estimate, frame, mask, kept))
@@ -137,6 +140,9 @@ class FinalRefinement:
     def adjust_all(self) -> None:
         """All frames were taken again: adjust poses, surface and lens together."""
         self._state.save()
+        if self._earlier is None and self._retracking.kept:  # nothing was saved with the frames that are kept
+            done = {"last_refined": max(self._estimates.causal), "refined_lines": self._estimates.lines}
+            self._state.save(self._session.state_dict(), **done, refinement_seconds=self._estimates.seconds)
         if self._precomputed is not None:
             self._write_precomputed(self._precomputed)
         else:
@@ -144,16 +150,25 @@ class FinalRefinement:
                 self._last.adjust_all()
             self._estimates.together += watch.times
             if self._session.config.object.segments_again:
-                self._last.begin_masks(self._session.config.has_given_masks)
+                self._last.begin_masks(self._session.config)
         self._writer.refine_camera(self._last.look.camera)
 
     def _write_precomputed(self, precomputed: PrecomputedRefinement) -> None:
         """Take over poses and masks; frames are then only drawn."""
         for record in precomputed.estimates.values():
-            self._estimates.put(record)
+            self._estimates.put(record, precomputed.retracked.get(record.index))
         for index, png in precomputed.masks.items():
             if (mask := decode_mask(png)) is not None:
                 self._estimates.put_mask(index, mask)
+
+    @property
+    def passed_over(self) -> dict[str, int]:
+        """How many frames each pass has left as they were, by its name."""
+        again = self._last.retracked if self._precomputed is None else self._precomputed.retracked
+        masks = self._last.masks
+        kept = 0 if masks is None else len(masks.kept)
+        kept = kept if self._precomputed is None else self._precomputed.kept_masks
+        return {"retracking": len(self._retracking.kept) - len(again), "masks": kept}
 
     @property
     def records(self) -> Iterable[FrameRecord]:

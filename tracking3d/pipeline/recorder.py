@@ -296,7 +296,7 @@ class ObjectRecorder:
             replaced = replaced and is_reconstructed(self.refinement.records, config, source)
             largest = min(largest, _MAX_PROVISIONAL_SIZE) if replaced else largest
             model = close_unseen(bake_texture(surface, views, largest, details=not replaced))
-            self._writer.end_refinement()
+            self._writer.end_refinement(self.refinement.passed_over)
             self._causal_model = None
         report_progress("writing the model")
         self._writer.finish(model, "finished")

@@ -22,19 +22,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.estimation.refined_start import LEAST_FRAMES, RefinedStart
+from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.earlier_refinement import EarlierRefinement
+from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.reconstruction.confidence import assess_estimate
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.reconstruction.held_adjustment import HeldAdjustment
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import adjusted_record
-from tracking3d.segmentation.frame_window import Answered
+from tracking3d.runtime.stage_times import StageTimes
+from tracking3d.segmentation.frame_window import Answered, FrameWindow
 from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter
 
 Decision = tuple[Frame, SegmentedMask | None]
@@ -49,41 +53,106 @@ class PrecomputedRefinement:
         look: What all frames together say of poses, surface and lens.
         estimates: The estimates with adjusted poses, by frame index.
         masks: The masks that were decided, as PNG, by index; their probabilities are written.
+        retracked: The masks of frames that were estimated again after the adjustment, as PNG, by index.
+        kept_masks: Number of masks that were not segmented again because nothing contradicts them.
     """
 
     look: GlobalAdjustment
     estimates: Mapping[int, FrameRecord]
     masks: Mapping[int, bytes]
+    retracked: Mapping[int, bytes]
+    kept_masks: int = 0
 
 
-def estimate_again(
-    session: Session,
-    frame: Frame,
-    causal: FrameRecord,
-    initial: MaskEstimate,
-    earlier: EarlierRefinement | None = None,
-) -> FrameEstimate | None:
-    """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may continue.
+class Retracking:
+    """Estimates frames again with the final model, those that need it.
+
+    A frame that was tracked, and whose mask agrees with the mask tracker's, keeps its causal estimate at first, with
+    the pose that this amounts to once the keyframes are refined. If the adjustment by landmarks turns that against the
+    other frames, or the silhouette there is not that of the mask, or there are no landmarks, it is estimated again.
 
     Args:
         session: Has refined everything, see `Session.refine`.
-        frame: The frame; frames come in order of time.
-        causal: Its causal estimate.
-        initial: Its initial mask.
+        masks: The causal estimates and their initial masks.
         earlier: The estimates that stand, if only some frames are refined.
 
-    Raises:
-        PluginError: If a plug-in fails, with ``runtime.on_plugin_failure`` ``stop``.
+    Attributes:
+        kept: Indices of the frames that keep their causal estimate at first.
+        most_degrees: By which the adjustment may turn them against the others.
+        least_agreement: IoU that their masks and silhouettes have to have.
     """
-    T_cam_obj = causal.T_cam_obj
-    if earlier is not None:
-        T_cam_obj = earlier.start.predict(frame.index, T_cam_obj, causal.through(session.camera).fx)
-    try:
-        return session.refine_frame(frame, initial, T_cam_obj)
-    except PluginError:
-        if session.config.runtime.on_plugin_failure == "stop":
-            raise
-        return None
+
+    def __init__(self, session: Session, masks: SavedMasks, earlier: EarlierRefinement | None = None) -> None:
+        self._session, self._masks = session, masks
+        self._causal, self._camera = masks.estimates.causal, session.camera
+        self._start = None if earlier is None else earlier.start
+        self._before: tuple[Frame, NDArray[np.float64]] | None = None
+        self.kept: frozenset[int] = frozenset()
+        self.most_degrees = session.config.object.retrack_angle
+        self.least_agreement = least = session.config.object.mask_agreement
+        if earlier is None and self.most_degrees:
+            self._start = self._refined_keyframes()
+            undoubted = (
+                one.index
+                for one in self._causal.values()
+                if one.status is Status.TRACKED and (one.iou_initial is None or one.iou_initial > least)
+            )
+            self.kept = frozenset(undoubted if self._start else ())
+
+    def _refined_keyframes(self) -> RefinedStart | None:
+        poses = {index: T for index, T in self._session.keyframe_poses().items() if index in self._causal}
+        if len(poses) < LEAST_FRAMES:
+            return None
+        causal = {index: self._causal[index] for index in poses}
+        return RefinedStart(
+            self._camera,
+            np.asarray(self._session.result().vertices, np.float64),
+            poses,
+            {index: one.T_cam_obj for index, one in causal.items()},
+            {index: one.through(self._camera).fx for index, one in causal.items()},
+        )
+
+    def keep(self, index: int) -> FrameRecord | None:
+        """The causal estimate of a frame as a refined one; None if it is to be estimated again."""
+        if index not in self.kept:
+            return None
+        record = self._causal[index]
+        return replace(
+            record, T_cam_obj=self._predict(record), camera=None, revision=True, refined=True, seconds=0.0,
+            stages=StageTimes(),
+        )  # fmt: skip
+
+    def pass_over(self, frame: Frame, T_cam_obj: NDArray[np.float64]) -> None:
+        """Take notice of a frame whose refined pose ``(4, 4)`` stands."""
+        self._before = frame, T_cam_obj
+
+    def take(self, frame: Frame) -> FrameEstimate | None:
+        """Estimate the object in a frame again; None if a plug-in fails and the run may continue.
+
+        Raises:
+            PluginError: If a plug-in fails, with ``runtime.on_plugin_failure`` ``stop``.
+        """
+        if self._before is not None:
+            self._session.keep_frame(*self._before)
+        self._before = None
+        try:
+            return self._session.refine_frame(
+                frame, self._masks.of(frame), self._predict(self._causal[frame.index])
+            )
+        except PluginError:
+            if self._session.config.runtime.on_plugin_failure == "stop":
+                raise
+            return None
+
+    def take_alone(self, frame: Frame) -> FrameEstimate | None:
+        """As `take`, but depending on the frame before and nothing else, so that any process can do it."""
+        with self._session.state_unchanged():
+            return self.take(frame)
+
+    def _predict(self, causal: FrameRecord) -> NDArray[np.float64]:
+        if self._start is None:
+            return causal.T_cam_obj
+        return self._start.predict(causal.index, causal.T_cam_obj, causal.through(self._camera).fx)
 
 
 class RefinementSteps:
@@ -95,10 +164,12 @@ class RefinementSteps:
         masks: Decides masks; None until `begin_masks`.
         fixed: Indices of frames whose masks the user has given: those stand.
         earlier: The estimates that stand, if only some frames are refined.
+        retracking: Estimates frames again that the adjustment moves; None if that was done.
 
     Attributes:
         look: As given.
         masks: As given, or begun.
+        retracked: The masks, as PNG, of the frames that were estimated again in `adjust`, by index.
     """
 
     def __init__(
@@ -108,8 +179,11 @@ class RefinementSteps:
         masks: VideoSegmenter | None = None,
         fixed: Collection[int] = (),
         earlier: EarlierRefinement | None = None,
+        retracking: Retracking | None = None,
     ) -> None:
         self._estimates, self._fixed, self._earlier = estimates, fixed, earlier
+        self._retracking = retracking
+        self.retracked: dict[int, bytes] = {}
         self.look, self.masks = look, masks
         self._waiting: dict[int, Frame] = {}
 
@@ -135,27 +209,51 @@ class RefinementSteps:
         if not record.refined:
             return record
         T_cam_obj, support = self.look.pose(record, frame.image, self._visible(record))
+        if self._retracking is not None and isinstance(self.look, GlobalAdjustment):
+            again = None
+            if frame.index in self._retracking.kept and self._needs_retracking(record, frame, T_cam_obj):
+                again = self._retracking.take_alone(frame)
+            self._retracking.pass_over(frame, record.T_cam_obj)
+            if again is not None:
+                self.retracked[frame.index] = self._estimates.put_retracked(again, frame.name)
+                record = self._estimates.estimate(frame.index)
+                T_cam_obj, support = self.look.pose(record, frame.image, self._visible(record))
         judged = () if support is None else assess_estimate(record, support)
         return adjusted_record(record, T_cam_obj, *judged)
 
-    def begin_masks(self, has_given_masks: bool) -> None:
+    def _needs_retracking(self, record: FrameRecord, frame: Frame, T_cam_obj: NDArray[np.float64]) -> bool:
+        """Whether the adjusted pose contradicts a causal estimate: its pose, or by the silhouette its mask."""
+        assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
+        if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
+            return True
+        window = FrameWindow.of(
+            self._segmentation_input(frame, T_cam_obj),
+            replace(self.look.camera, lens=None),
+            self.look.vertices_of_landmarks,
+            self.look.faces,
+        )
+        agreement = None if window is None else mask_iou_or_none(window.answer, window.drawn)
+        return (agreement or 0.0) <= self._retracking.least_agreement
+
+    def begin_masks(self, config: PipelineConfig) -> None:
         """Begin with the masks; which poses are reliable is taken from the estimates as they are now.
 
-        Args:
-            has_given_masks: Whether the user gives the initial masks.
+        Frames from before the first map, which were answered when it came, have their masks decided in any case, and
+        given masks decide what becomes of all.
         """
+        given = config.has_given_masks
+        may_keep = () if given else [one.index for one in self._estimates.causal.values() if not one.revision]
         known = {one.index: one.confidence for one in self._estimates.all() if _has_pose(one)}
         pinhole = replace(self.look.camera, lens=None)
         due = None if self._earlier is None else self._earlier.near
-        self.masks = VideoSegmenter(
-            pinhole, self.look.vertices_of_landmarks, self.look.faces, known, due, has_given_masks
-        )
+        surface = self.look.vertices_of_landmarks, self.look.faces
+        agreement = config.object.mask_agreement
+        self.masks = VideoSegmenter(pinhole, *surface, known, due, given, frozenset(may_keep), agreement)
 
     def collect_mask(self, frame: Frame) -> None:
         """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
-        if self.masks.wants(frame.index):
-            self.masks.see(self._segmentation_input(frame))
+        self.masks.see(self._segmentation_input(frame))
 
     def settle_masks(self) -> None:
         """All frames were collected: put together what their masks have in common."""
@@ -165,7 +263,7 @@ class RefinementSteps:
     def decide(self, frame: Frame) -> Iterator[Decision]:
         """Take the next frame, in order of time; gives those whose turn has come."""
         assert self.masks is not None
-        if self._earlier is not None and frame.index not in self._earlier.shown:
+        if not self.masks.needs(frame.index):
             yield from self.decide_rest()
             yield frame, None
             return
@@ -177,17 +275,18 @@ class RefinementSteps:
         assert self.masks is not None
         yield from map(self._make_decision, self.masks.rest())
 
-    def _segmentation_input(self, frame: Frame) -> Answered:
-        """A frame as `VideoSegmenter` takes it: through a camera without lens distortion."""
+    def _segmentation_input(self, frame: Frame, T_cam_obj: NDArray[np.float64] | None = None) -> Answered:
+        """A frame as `VideoSegmenter` takes it, through a camera without distortion; at another pose if given."""
         camera, record = self.look.camera, self._estimates.estimate(frame.index)
         mask, initial = self._estimates.mask(record), self._estimates.initial_mask(frame.index)
         occluder = self._estimates.occluder(frame.index)
+        T_cam_obj = record.T_cam_obj if T_cam_obj is None else T_cam_obj
         return Answered(
             record.index,
             camera.undistort(frame.image),
             camera.mask_to_pinhole(np.zeros_like(mask) if initial is None else initial),
             camera.mask_to_pinhole(mask),
-            record.T_cam_obj if _has_pose(record) else np.full((4, 4), np.nan),
+            T_cam_obj if _has_pose(record) else np.full((4, 4), np.nan),
             record.confidence,
             None if occluder is None else camera.mask_to_pinhole(occluder),
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -218,11 +219,26 @@ class SessionRefinement:
         self.refining, self._state, self._camera, self._refined = watch.times, state, start.camera, True
         return True
 
+    def keyframe_poses(self) -> Mapping[int, NDArray[np.float64]]:
+        """Refined poses ``(4, 4)`` of keyframes after `refine`, see `ContinuingSolver.keyframe_poses`."""
+        if not isinstance(self._solver, ContinuingSolver) or self._presented.last is not None:
+            return {}
+        return self._solver.keyframe_poses(self._state)
+
     def keep_frame(self, frame: Frame, T_cam_obj: NDArray[np.float64]) -> None:
         """Take a frame whose refined pose ``(4, 4)`` stands, before the next one is refined."""
         if isinstance(self._solver, ContinuingSolver):
             with self._settings.in_force():
                 self._state = self._solver.keep_frame(self._state, frame, T_cam_obj)
+
+    @contextmanager
+    def state_unchanged(self) -> Iterator[None]:
+        """The frames that are taken within leave no trace in the session."""
+        state = self._state
+        try:
+            yield
+        finally:
+            self._state = state
 
     def refine_frame(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
         """Estimate for a frame once more, against the final object. Frames come in order of time.

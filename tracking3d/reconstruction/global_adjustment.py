@@ -75,6 +75,7 @@ class GlobalAdjustment:
         self._scene: LandmarkScene | None = None
         self._bundled: list[int] = []
         self._before: dict[int, _Pose] = {}
+        self._turn = np.eye(3)
 
     def wants(self, index: int) -> bool:
         """Whether a frame is one of those that `see` may keep."""
@@ -104,6 +105,7 @@ class GlobalAdjustment:
         self.vertices_of_landmarks = scene.vertices
         self._scene = fit_outlines(scene)
         self.vertices = self._scene.vertices
+        self._turn = self._common_turn()
         deviation = scene.focal_deviation
         if deviation is not None and deviation > LENS_KNOWN:
             self.camera = self.camera.zoom(scene.focal_factor, DEFAULT_ORIGIN)
@@ -165,6 +167,27 @@ class GlobalAdjustment:
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
         return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
+
+    def deviation(self, record: FrameRecord, T_cam_obj: _Pose) -> float:
+        """Degrees by which `pose` turned a frame against the other frames; infinite if it had no landmarks to do so.
+
+        Args:
+            record: The frame's estimate before.
+            T_cam_obj: ``(4, 4)`` its pose after.
+        """
+        if self._scene is None:
+            return math.inf
+        turned = self._as_settled(record.T_cam_obj)[:3, :3].T @ T_cam_obj[:3, :3]
+        return float(np.degrees(Rotation.from_matrix(self._turn.T @ turned).magnitude()))
+
+    def _common_turn(self) -> NDArray[np.float64]:
+        """``(3, 3)`` how the object frame was turned: of all bundled frames, the turn that is nearest to the others."""
+        assert self._scene is not None
+        kept = [view.T_cam_obj for view in self._scene.views if view is not None]
+        before = [self._as_settled(self._before[index]) for index in self._bundled]
+        turns = np.stack([b[:3, :3].T @ a[:3, :3] for b, a in zip(before, kept, strict=True)])
+        cosines = np.clip((np.einsum("nij,mij->nm", turns, turns) - 1) / 2, -1, 1)
+        return np.asarray(turns[np.arccos(cosines).sum(1).argmin()])
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""

@@ -110,6 +110,7 @@ def refinement(
     together: StageTimes | None = None,
     kept: int = 0,
     start: StartOfModel | None = None,
+    passed_over: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """The outcome of a final refinement.
 
@@ -122,6 +123,7 @@ def refinement(
         together: Times of the global refinement of the map, before the frames.
         kept: Number of refined estimates that are those of the run before its last correction.
         start: Where the refined model started; None until that is decided.
+        passed_over: How many frames each pass has left as they were, by its name.
     """
     return {
         "state": state,
@@ -132,6 +134,7 @@ def refinement(
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
         "kept_refined": kept if refined else 0,
+        "passed_over": dict(passed_over or {}) if refined else {},
         "seconds": seconds,
         "stages": _plain(stages_of(refined), together),
         "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.results import layout
-from tracking3d.results.files import decode_mask, mask_file, read_mask, write_mask
+from tracking3d.results.files import decode_mask, link_or_copy, mask_file, read_mask, write_mask, writing
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader, read_records
@@ -77,13 +77,28 @@ class RefinedEstimates:
         occluder = self.occluder(index)
         return mask if occluder is None else mask & ~occluder
 
-    def put(self, record: FrameRecord) -> None:
-        """Replace a refined estimate, see `put_right`; causal ones stand.
+    def put(self, record: FrameRecord, mask: bytes | None = None) -> None:
+        """Replace a refined estimate, and its mask if that is given as PNG; causal ones stand.
 
         It is not saved for a run that is stopped here and resumed later: that computes it again.
         """
         if record.index in self._records:
             self._records[record.index] = record
+            if mask is not None:
+                self._decided[record.index] = mask
+
+    def put_retracked(self, estimate: FrameEstimate, name: str) -> bytes:
+        """Put an estimate that was made after all others in the place of the first; returns its mask as PNG.
+
+        Raises:
+            OutputError: If its probability cannot be written.
+        """
+        index, mask = estimate.index, mask_file(estimate.mask)
+        estimate = replace(estimate, keyframe=self.causal[index].keyframe)
+        self.put(FrameRecord.of(estimate, name, self.initial_mask(index), revision=True), mask)
+        if self.writes_probabilities:
+            write_probability(self._aside, index, estimate.probability)
+        return mask
 
     def put_mask(
         self, index: int, mask: NDArray[np.bool_], probability: NDArray[np.float32] | None = None
@@ -109,6 +124,20 @@ class RefinedEstimates:
         self._decided[index] = mask_file(mask)
         if probability is not None and self.writes_probabilities:
             write_probability(self._aside, index, probability)
+
+
+def keep_masks(source: Path, into: Path, index: int) -> None:
+    """Take mask and probability of a frame from one folder into another one with ``masks/``.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with writing(into):
+        link_or_copy(layout.mask_path(source, index), layout.mask_path(into, index))
+        if (file := layout.probability_path(source, index)).is_file():
+            place = layout.probability_path(into, index)
+            place.parent.mkdir(exist_ok=True)
+            link_or_copy(file, place)
 
 
 def write_refined(

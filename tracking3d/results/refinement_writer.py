@@ -20,11 +20,11 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import link_or_copy, write_atomic, writing
+from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refined_estimates import RefinedEstimates, write_refined
+from tracking3d.results.refined_estimates import RefinedEstimates, keep_masks, write_refined
 from tracking3d.runtime.stage_times import StageTimes, measure
 
 
@@ -43,6 +43,7 @@ class RefinementWriter(RefinedEstimates):
         pictures: Overlay and crops of the second pass.
         together: Times of the global refinement of the map, before the frames.
         kept: Number of estimates that are those of an earlier refinement.
+        passed_over: How many frames each pass has left as they were, by its name.
         start: Where the refined model started; None until that is decided.
 
     Raises:
@@ -62,6 +63,7 @@ class RefinementWriter(RefinedEstimates):
         self._started = time.monotonic() - seconds
         self._taken_over = False
         self.together, self.kept = StageTimes(), 0
+        self.passed_over: dict[str, int] = {}
         self.start: description.StartOfModel | None = None
         self.pictures = Pictures(aside / layout.OVERLAY, camera, fps)
         with writing(aside):
@@ -134,19 +136,11 @@ class RefinementWriter(RefinedEstimates):
         Raises:
             OutputError: If it cannot be written.
         """
-        with writing(self._aside):
-            link_or_copy(layout.mask_path(earlier, record.index), layout.mask_path(self._aside, record.index))
-            if (
-                self.writes_probabilities
-                and (file := layout.probability_path(earlier, record.index)).is_file()
-            ):
-                place = layout.probability_path(self._aside, record.index)
-                place.parent.mkdir(exist_ok=True)
-                link_or_copy(file, place)
-            with (self._aside / layout.FRAMES).open("ab") as lines:
-                lines.write(record.to_json().encode() + b"\n")
+        keep_masks(earlier, self._aside, record.index)
+        with writing(self._aside), (self._aside / layout.FRAMES).open("ab") as lines:
+            lines.write(record.to_json().encode() + b"\n")
         self._records[record.index] = record
-        self.kept += 1
+        self.kept += earlier != self._folder
 
     def take_over(self, append: Callable[[Sequence[FrameRecord]], None]) -> None:
         """Put masks and video in their places; what they replace goes to ``causal/``, the mesh too.
@@ -199,7 +193,15 @@ class RefinementWriter(RefinedEstimates):
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(
-            state, reason, causal, refined, self.seconds, self.together, self.kept, self.start
+            state,
+            reason,
+            causal,
+            refined,
+            self.seconds,
+            self.together,
+            self.kept,
+            self.start,
+            self.passed_over,
         )
 
 

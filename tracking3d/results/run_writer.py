@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -216,13 +216,17 @@ class RunWriter:
             self._description["camera"] = asdict(camera)
             self._write_description()
 
-    def end_refinement(self) -> None:
+    def end_refinement(self, passed_over: Mapping[str, int]) -> None:
         """Replace the causal estimates by the refined ones; the causal ones go to ``causal/``.
+
+        Args:
+            passed_over: How many frames each pass has left as they were, by its name.
 
         Raises:
             OutputError: If it cannot be done.
         """
         assert self._refinement is not None
+        self._refinement.passed_over = dict(passed_over)
         self._refinement.take_over(self._lines.append)
         self._description["refinement"] = self._refinement.describe("finished")
         self._description["camera"] = asdict(self._camera)

@@ -31,7 +31,7 @@ from tracking3d.segmentation.whole_video_weights import WEIGHTS
 
 _LEAST_CONFIDENCE = 0.5
 """Of the frames that are combined; all if none has it."""
-MOST_VIEWS = 60
+MOST_VIEWS = 24
 """The most frames that are combined, spread over the reliable ones."""
 _ASKED = 0.4
 """How far the image smooths what is said, see `snap_to_edges`: in an even one outlines would creep."""
@@ -67,9 +67,12 @@ class VideoSegmenter:
         confidences: Of the frames that have a pose, by index.
         due: Indices of the frames that are decided; all if None.
         has_given_masks: Whether the user gives the initial masks: they are kept if they agree with each other.
+        may_keep: Indices of the frames that keep their mask if nothing contradicts it.
+        agreement: IoU above which silhouette and initial mask do not.
 
     Attributes:
         order: The latest frames of the second time.
+        kept: The frames that keep their mask.
     """
 
     def __init__(
@@ -80,9 +83,14 @@ class VideoSegmenter:
         confidences: dict[int, float],
         due: Collection[int] | None = None,
         has_given_masks: bool = False,
+        may_keep: Collection[int] = (),
+        agreement: float = 1.0,
     ) -> None:
+        self._may_keep, self._least_agreement = may_keep, agreement
+        self.kept: set[int] = set()
+        self._seen: list[int] = []
         self._camera, self._vertices, self._faces = camera, vertices, faces
-        self._due = due
+        self._due, self._shown = due, frozenset[int]()
         chosen = sorted(index for index, confidence in confidences.items() if confidence >= _LEAST_CONFIDENCE)
         chosen = chosen or sorted(confidences)
         places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
@@ -93,16 +101,18 @@ class VideoSegmenter:
         self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
         self._jobs: OrderedExecutor | None = None
 
-    def wants(self, index: int) -> bool:
-        """Whether a frame is one of those that are put together; `see` passes the others over."""
-        return index in self._wanted
-
     def see(self, frame: Answered) -> None:
-        """A frame for the first time."""
-        if not self.wants(frame.index) or not np.isfinite(frame.T_cam_obj).all():
+        """A frame for the first time, in the order of time; some of them are put together."""
+        self._seen.append(frame.index)
+        wanted, may_keep = frame.index in self._wanted, frame.index in self._may_keep
+        if not (wanted or may_keep) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = self._scene(frame)
-        if scene is not None and scene.answer.any():
+        if scene is None or not scene.answer.any():
+            return
+        if may_keep and _agreement(scene) > self._least_agreement:
+            self.kept.add(frame.index)
+        if wanted:
             self._consensus.see(scene)
             if self._agreement is not None:
                 self._agreement.see(scene)
@@ -110,9 +120,18 @@ class VideoSegmenter:
 
     def settle(self) -> None:
         """All frames were seen a first time."""
+        due = self._seen if self._due is None else self._due
+        self._due = frozenset(due) - self.kept
+        places = [place for place, index in enumerate(self._seen) if index in self._due]
+        near = {place + step for place in places for step in range(-REACH, REACH + 1)}
+        self._shown = frozenset(index for place, index in enumerate(self._seen) if place in near)
         self._consensus.settle()
         if self._agreement is not None:
             self._agreement.settle()
+
+    def needs(self, index: int) -> bool:
+        """Whether a frame is decided, or tells the motion around one that is; before any other comes `rest`."""
+        return index in self._shown
 
     def decide(self, frame: Answered) -> Iterator[tuple[int, SegmentedMask | None]]:
         """A frame for the second time.
@@ -198,6 +217,14 @@ class VideoSegmenter:
             return 0.0
         scene = self._scene(frame)
         return 0.0 if scene is None or not scene.initial.any() else self._agreement.of_frame(scene)
+
+
+def _agreement(scene: FrameWindow) -> float:
+    """The lower IoU of a frame's mask with the silhouette and with the initial mask, where there is one."""
+    others = [scene.drawn & scene.valid, *([scene.initial] if scene.initial.any() else [])]
+    return min(
+        np.count_nonzero(scene.answer & other) / np.count_nonzero(scene.answer | other) for other in others
+    )
 
 
 def segment_all(

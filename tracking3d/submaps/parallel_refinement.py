@@ -28,7 +28,7 @@ from tracking3d.runtime.concurrency import read_ahead
 from tracking3d.segmentation.temporal_neighbours import REACH
 from tracking3d.segmentation.whole_video import VideoSegmenter
 from tracking3d.submaps.merged_run import move_refined_estimates
-from tracking3d.submaps.submap_runs import Revisit, Tell, resume_submap
+from tracking3d.submaps.submap_runs import Revisit, Tell, resume_retracking, resume_submap
 from tracking3d.video import open_source
 from tracking3d.video.selection import parse_selection
 
@@ -67,12 +67,14 @@ class Weighing:
         job: The frames; those of the whole video when masks are collected.
         estimates: Those of the whole video with their final poses, by frame index.
         look: What all frames say together.
+        retracked: The masks of frames that were estimated again after the adjustment, as PNG, by index.
         masks: What the masks of all frames have in common; None when that is to be found.
     """
 
     job: Revisit
     estimates: Mapping[int, FrameRecord]
     look: GlobalAdjustment
+    retracked: Mapping[int, bytes]
     masks: VideoSegmenter | None = None
 
 
@@ -97,15 +99,23 @@ def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
     return look
 
 
-def adjust_poses(tell: Tell, job: Placing) -> list[FrameRecord]:
-    """The estimates of some frames with their adjusted poses.
+def adjust_poses(tell: Tell, job: Placing) -> tuple[list[FrameRecord], dict[int, bytes]]:
+    """The estimates of some frames with their adjusted poses, and the masks of those that were estimated again.
 
     Raises:
         Tracking3dError: If something cannot be read.
     """
     estimates = _estimates(job.job.folder, job.look.camera)
-    last = RefinementSteps(estimates, job.look)
-    return [last.adjust(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
+    retracking = resume_retracking(job.job, *resume_submap(job.job))
+    last = RefinementSteps(estimates, job.look, retracking=retracking)
+    found, own = list[FrameRecord](), parse_selection(job.job.selection)
+    before = max(own.start - own.step, parse_selection(job.job.whole).start)
+    for frame in _frames(job.job.source, f"{before}:{own.stop}:{own.step}", estimates):
+        if frame.index in own:
+            found.append(last.adjust(frame))
+        elif (record := estimates.estimate(frame.index)).refined:
+            retracking.pass_over(frame, record.T_cam_obj)
+    return found, last.retracked
 
 
 def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
@@ -116,9 +126,9 @@ def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
     """
     estimates = _estimates(job.job.folder, job.look.camera)
     last = RefinementSteps(estimates, job.look)
-    last.begin_masks(job.job.config.has_given_masks)  # before poses are adjusted, as in one process
+    last.begin_masks(job.job.config)  # before poses are adjusted, as in one process
     for record in job.estimates.values():
-        estimates.put(record)
+        estimates.put(record, job.retracked.get(record.index))
     for frame in _frames(job.job.source, job.job.whole, estimates):
         last.collect_mask(frame)
     last.settle_masks()
@@ -135,7 +145,7 @@ def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
     folder, own, found = job.job.folder, parse_selection(job.job.selection), dict[int, bytes]()
     estimates = _estimates(folder, job.look.camera)
     for record in job.estimates.values():
-        estimates.put(record)
+        estimates.put(record, job.retracked.get(record.index))
     for frame, decided in _decisions(job, estimates, own):
         if decided is not None and frame.index in own:
             found[frame.index] = mask_file(decided.mask)

@@ -94,12 +94,13 @@ def _refine_in_parallel(
         Step(adjust_poses, Placing(job, look), f"poses {number} of {of}")
         for number, job in enumerate(looks, 1)
     ]
-    estimates = {record.index: record for part in placed for record in part}
+    estimates = {record.index: record for part, _ in placed for record in part}
+    retracked = {index: mask for _, part in placed for index, mask in part.items()}
     seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
     if not merged.begun.config.object.segments_again:
-        return PrecomputedRefinement(look, estimates, {}), seconds
+        return PrecomputedRefinement(look, estimates, {}, retracked), seconds
     clock = time.monotonic()
-    weighing = Weighing(looks[0], estimates, look)
+    weighing = Weighing(looks[0], estimates, look, retracked)
     [masks] = yield [Step(put_together, weighing, "collecting its masks")]
     decided = yield [
         Step(weigh, replace(weighing, job=job, masks=masks), f"masks {number} of {of}")
@@ -107,7 +108,8 @@ def _refine_in_parallel(
     ]
     pictures = {index: mask for part in decided for index, mask in part.items()}
     masks_took = time.monotonic() - clock
-    return PrecomputedRefinement(look, estimates, pictures), {**seconds, "masks": masks_took}
+    precomputed = PrecomputedRefinement(look, estimates, pictures, retracked, len(masks.kept))
+    return precomputed, {**seconds, "masks": masks_took}
 
 
 def _frames(job: PartJob | Revisit) -> int:

@@ -10,22 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import SavedState
 from tracking3d.config.models import PipelineConfig
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.frames import Frame
 from tracking3d.pipeline.frame_reading import read_timed
 from tracking3d.pipeline.open_tracking import open_tracking, request_tracking
 from tracking3d.pipeline.record import RecordOptions, record_tracking
-from tracking3d.pipeline.refinement_steps import estimate_again
+from tracking3d.pipeline.refinement_steps import Retracking
+from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, writing
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refined_estimates import write_refined
+from tracking3d.results.refined_estimates import RefinedEstimates, keep_masks, write_refined
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 from tracking3d.video.source import FrameSource
@@ -117,6 +116,7 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
         Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
     """
     kept, session = resume_submap(job)
+    retracking = resume_retracking(job, kept, session)
     causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
     with writing(job.out):
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
@@ -125,7 +125,7 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
         for frame in read_timed(open_source(job.source, job.selection)):
             if not isinstance(frame, Frame) or frame.index not in causal:
                 continue
-            record_ = _refine_estimate(session, job, kept, frame, causal[frame.index])
+            record_ = _refine_estimate(retracking, job, frame, causal[frame.index])
             if record_ is not None:
                 with writing(job.out):
                     lines.write(record_.to_json().encode() + b"\n")
@@ -149,15 +149,24 @@ def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
     return kept, session
 
 
+def resume_retracking(job: Revisit, kept: SavedState, session: Session) -> Retracking:
+    """What estimates the frames of the merged run again."""
+    estimates = RefinedEstimates.of_folder(job.folder, (session.camera.height, session.camera.width))
+    initial = {index: (taken.score, taken.reason) for index, taken in kept.taken.items()}
+    return Retracking(session, SavedMasks(estimates, initial))
+
+
 def _refine_estimate(
-    session: Session, job: Revisit, kept: SavedState, frame: Frame, causal: FrameRecord
+    retracking: Retracking, job: Revisit, frame: Frame, causal: FrameRecord
 ) -> FrameRecord | None:
     """The record of a frame's second estimate, its mask written; None lets the first stand."""
-    mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
-    taken = kept.taken[frame.index]
-    initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)
-    estimate = estimate_again(session, frame, causal, initial)
+    if (record := retracking.keep(frame.index)) is not None:
+        retracking.pass_over(frame, record.T_cam_obj)
+        keep_masks(job.folder, job.out, frame.index)
+        return record
+    estimate = retracking.take(frame)
     if estimate is None:
         return None
+    mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
     probabilities = (job.folder / layout.PROBABILITIES).is_dir()
     return write_refined(job.out, estimate, frame, causal, mask, probabilities)

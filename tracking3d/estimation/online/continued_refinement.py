@@ -41,6 +41,14 @@ class ContinuedRefinement(FrameTracker):
             tracked_points=FollowedPoints.none(),
         )
 
+    def keyframe_poses(self, state: SolverState) -> dict[int, NDArray[np.float64]]:
+        """Refined poses ``(4, 4)`` of the keyframes of a map with points, if the causal poses are all of that map."""
+        object_map = state.object_map
+        one_map = not (state.inactive_maps or state.extended or object_map.fixed_keyframes)
+        if state.surface is None or object_map.pointless or not one_map:
+            return {}
+        return {view.index: view.pose.matrix().double().cpu().numpy() for view in object_map.keyframes}
+
     def keep_frame(self, state: SolverState, frame: Frame, T_cam_obj: NDArray[np.float64]) -> SolverState:
         """Take a frame whose refined pose stands, so that its landmarks are followed into the next one."""
         object_map = state.object_map
