@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tracking3d.estimation.feature_space import SPREAD, FeatureSpace, feature_channels
+from tracking3d.estimation.feature_space import SPREAD, FeatureSpace, contrast_of, feature_channels
 
 SIZE = 24
 
@@ -92,3 +92,36 @@ def test_only_encoders_with_more_channels_are_reduced():
             return images
 
     assert [feature_channels(Encoder(), limit) for limit in (None, 16, 64, 200)] == [64, 16, 64, 64]
+
+
+@pytest.fixture
+def plain_with_a_mark():
+    """A grey disc, brighter to the right, with a dark stroke of 2 pixels, on a striped background."""
+    y, x = np.mgrid[:96, :96]
+    inside = np.hypot(x - 48, y - 48) < 36
+    image = np.where(inside, 0.4 + 0.002 * x, 0.2 + 0.5 * (x // 12 % 2))
+    stroke = (abs(y - 48) < 1) & (abs(x - 40) < 8)
+    image[stroke] -= 0.2
+    return torch.tensor(image, dtype=torch.float32).expand(3, 96, 96).contiguous(), inside, stroke
+
+
+def test_the_contrast_is_that_of_marks_not_of_shading_or_the_outline(plain_with_a_mark):
+    image, inside, stroke = plain_with_a_mark
+    contrast = contrast_of(image, 96)[0].numpy()
+    assert abs(contrast[stroke] + 0.2).max() < 0.03
+    assert abs(contrast[inside & ~stroke]).mean() < 0.01
+    assert contrast_of(image, 48).shape == (1, 48, 48)
+
+
+def test_a_space_with_contrast_has_one_channel_more_and_the_others_as_they_were(plain_with_a_mark):
+    image, inside, stroke = plain_with_a_mark
+    mask = torch.from_numpy(inside).float()
+    space = FeatureSpace.of(image + 0.01 * torch.randn(3, 96, 96, generator=torch.manual_seed(0)), mask, 3)
+    both = space.with_contrast()
+    features = both.project(image, image)
+    assert features.shape == (4, 96, 96)
+    torch.testing.assert_close(features[:3], space.project(image, image))
+    torch.testing.assert_close(features, both.add_contrast(features[:3], image))
+    assert both.add_contrast(features, image) is features  # it has it already
+    assert space.add_contrast(features[:3], image).shape == (3, 96, 96)
+    assert features[3].abs()[torch.from_numpy(stroke)].min() > 10 * features[3].abs()[mask > 0].median()

@@ -7,10 +7,13 @@ made for. Rotating and scaling all channels alike keeps what is near to what.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
+import cv2
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from tracking3d.features.protocol import FeatureEncoder
 
@@ -22,6 +25,10 @@ TAU = 0.5
 """Convergence threshold of the appearance loss of features with this spread: frames that are tracked well stay
 below 0.45 (measured with s2dnet), and unrelated texels would cost about 0.7."""
 
+_MEDIAN_SIZE = (
+    13  # pixels of the working resolution along the side of the window whose median is around one (chosen)
+)
+_CONTRAST = 3.0  # factor of the contrast, relative to that of the other channels (chosen)
 _LEAST_PIXELS = 16  # in the mask, for a principal component analysis to mean anything
 
 
@@ -33,11 +40,13 @@ class FeatureSpace:
         mean: ``(C,)`` what is taken off.
         components: ``(K, C)`` what it is multiplied by afterwards.
         kept: Share of the variance inside the first mask that is kept, in [0, 1].
+        contrast: Factor of a last channel, see `contrast_of`; 0 without it.
     """
 
     mean: Tensor
     components: Tensor
     kept: float = 1.0
+    contrast: float = 0.0
 
     @classmethod
     def of(cls, features: Tensor, mask: Tensor, channels: int) -> FeatureSpace:
@@ -62,10 +71,44 @@ class FeatureSpace:
         components = (components * largest.sign() * scale).to(features)
         return cls(mean, components, float(kept / total.clamp_min(1e-12)))
 
-    def project(self, features: Tensor) -> Tensor:
-        """``(C, S, S)`` features as ``(K, S, S)``."""
-        centred = features - self.mean[:, None, None]
-        return torch.einsum("kc,chw->khw", self.components, centred)
+    def project(self, features: Tensor, image: Tensor | None = None) -> Tensor:
+        """Features of this space.
+
+        Args:
+            features: ``(C, S, S)`` of the encoder.
+            image: ``(3, nS, nS)`` RGB, which they are of; needed for the contrast only.
+
+        Returns:
+            ``(K, S, S)``, with the contrast one more.
+        """
+        projected = torch.einsum("kc,chw->khw", self.components, features - self.mean[:, None, None])
+        return projected if image is None else self.add_contrast(projected, image)
+
+    def add_contrast(self, features: Tensor, image: Tensor) -> Tensor:
+        """Features of this space ``(K, S, S)`` with the contrast of the image ``(3, nS, nS)`` if that is part of it."""
+        if not self.contrast or len(features) > len(self.components):
+            return features
+        return torch.cat([features, self.contrast * contrast_of(image, features.shape[-1])])
+
+    def with_contrast(self) -> FeatureSpace:
+        """The space with a last channel for the contrast of small marks, as a plain object needs it.
+
+        Marks such as a seam or a logo cover so few pixels that their colours hardly count, and light changes the
+        colours of all others while the object turns.
+        """
+        scale = float(self.components.norm()) / math.sqrt(len(self.components))
+        return replace(self, contrast=_CONTRAST * scale)
+
+
+def contrast_of(image: Tensor, size: int) -> Tensor:
+    """``(1, size, size)`` by how much each pixel of an RGB image is brighter than the median of those around it.
+
+    It is 0 on plain surface under slowly varying light, and along an edge between two such areas, such as an outline.
+    """
+    grey = functional.interpolate(image.mean(0)[None, None], size=(size, size), mode="area")
+    pixels = (255 * grey[0, 0]).round().byte().cpu().numpy()
+    around = torch.from_numpy(cv2.medianBlur(pixels, _MEDIAN_SIZE)).to(grey) / 255
+    return grey[0] - around
 
 
 def feature_channels(encoder: FeatureEncoder, limit: int | None) -> int:

@@ -62,4 +62,4 @@ class SolverBase:
         observation = observe(frame, mask, window, camera, self.encoder, self.device)
         if space is None:
             return observation
-        return replace(observation, features=space.project(observation.features))
+        return replace(observation, features=space.project(observation.features, observation.image))

@@ -40,16 +40,20 @@ def in_space(
 
     def encoded(observation: Observation) -> Observation:
         if own is not None and space is not None and own.components.shape[0] == own.components.shape[1]:
-            flat = observation.features.flatten(1)
-            whole = torch.linalg.solve(own.components, flat).view_as(observation.features)
-            return replace(observation, features=space.project(whole + own.mean[:, None, None]))
+            kept = observation.features[: len(own.components)]
+            whole = torch.linalg.solve(own.components, kept.flatten(1)).view_as(kept)
+            return replace(
+                observation, features=space.project(whole + own.mean[:, None, None], observation.image)
+            )
         size = (observation.window.size,) * 2
         image = functional.interpolate(observation.image[None], size=size, mode="bilinear", antialias=True)
         features = encoder.encode(image if encoder.stride == 1 else observation.image[None])
         if features.shape[-1] != size[0]:
             features = functional.interpolate(features, size=size, mode="bilinear", antialias=True)
         features = features[0].float()
-        return replace(observation, features=features if space is None else space.project(features))
+        return replace(
+            observation, features=features if space is None else space.project(features, observation.image)
+        )
 
     keyframes = tuple(
         replace(view, observation=encoded(view.observation), texture=None) for view in object_map.keyframes

@@ -10,6 +10,7 @@ import numpy as np
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.initialization.initial_map import with_contrast
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, refine_local_map
 from tracking3d.estimation.online.masks.frame_estimates import learn_colours, make_estimate
@@ -118,6 +119,8 @@ def _estimate_in_turn(
         view = with_focal_length(seen, before, state.camera)
         if state.object_map.pointless:
             view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
+        if state.feature_space is not None:
+            view = with_contrast(view, state.feature_space)
         assert state.surface is not None
         starts = {origin: poses.get(view.index, pose)}
         fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]

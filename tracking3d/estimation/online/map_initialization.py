@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.first_estimates import estimate_arrived_frames, estimate_pending_frames
-from tracking3d.estimation.online.initialization.initial_map import InitialMap
+from tracking3d.estimation.online.initialization.initial_map import InitialMap, with_contrast
 from tracking3d.estimation.online.initialization.initializer import (
     add_pending_frame,
     restart_if_misfit,
@@ -89,6 +89,10 @@ class MapInitialization(MapExtension):
     def _initialize(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
         """Make the first map, and estimate all pending frames with it."""
         assert state.pending is not None
+        if start.object_map.pointless and (space := state.feature_space) is not None:
+            state = replace(state, feature_space=(space := space.with_contrast()))
+            views = tuple(with_contrast(view, space) for view in start.object_map.keyframes)
+            start = replace(start, object_map=replace(start.object_map, keyframes=views))
         everything = list(range(len(start.object_map.keyframes)))
         waiting, before, camera = (*state.rested, *state.pending), state.camera, start.camera
         with in_stage("map"):

@@ -128,7 +128,7 @@ class OnlineSolver(MapInitialization):
         if space is None:
             channels = feature_channels(self.encoder, self.config.object.texture_channels)
             space = FeatureSpace.of(observation.features, observation.mask, channels)
-        observation = replace(observation, features=space.project(observation.features))
+        observation = replace(observation, features=space.project(observation.features, observation.image))
         window = cut_around_object(object_map, camera, frame.image, binary, pose)
         view = Keyframe(observation, binary, pose, FollowedPoints.none(), image=window)
         object_map, view = insert_points(object_map, camera, view, image)
@@ -245,7 +245,8 @@ class OnlineSolver(MapInitialization):
             if binary is None:
                 continue
             if begun is None:
-                begun, _ = self._first_state(frame, binary, self.camera, state.feature_space)
+                space = state.feature_space and replace(state.feature_space, contrast=0.0)
+                begun, _ = self._first_state(frame, binary, self.camera, space)
             depth = first_translation(mask_ellipse(binary), self.camera)
             pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=self.device))
             view = self._view(begun, frame, binary, pose, FollowedPoints.none())

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from tracking3d.bundle_adjustment.adjustment import Structure
+from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import downsample
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
@@ -139,6 +140,13 @@ def with_observations(object_map: ObjectMap, views: list[Keyframe], coarse: bool
         for posed, view in zip(object_map.keyframes, views, strict=True)
     ]
     return replace(object_map, keyframes=tuple(keyframes))
+
+
+def with_contrast(view: Keyframe, space: FeatureSpace) -> Keyframe:
+    """A view with the contrast among its features, if the space has it."""
+    seen = view.observation
+    features = space.add_contrast(seen.features, seen.image)
+    return view if features is seen.features else replace(view, observation=replace(seen, features=features))
 
 
 def initialize_without_points(

@@ -22,6 +22,7 @@ from tracking3d.estimation.online.initialization.initial_map import (
     initialize_without_points,
     restart_without_points,
     solve_start,
+    with_contrast,
 )
 from tracking3d.estimation.online.initialization.structure_from_motion import image_deformation
 from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses
@@ -234,6 +235,8 @@ def _start_without_points(
     if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= MOST_WAITING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
+    if state.feature_space is not None:
+        views = [with_contrast(view, state.feature_space.with_contrast()) for view in views]
     return state, initialize_without_points(
         state.object_map, state.camera, views, FitWeights(smoothness=config.smoothness)
     )[0]
