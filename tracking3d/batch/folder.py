@@ -21,54 +21,32 @@ _SILENT = 120.0  # seconds after which a batch that says nothing is taken for en
 
 @dataclass(frozen=True)
 class Failure:
-    """A video that came to nothing.
+    """A video that came to nothing."""
 
-    Attributes:
-        run: What its run folder would have been called.
-        video: The video.
-        reason: Why, in a sentence.
-        attempts: How often it was begun.
-        crashed: Whether its process ended.
-        log: Path of its log.
-    """
-
-    run: str
-    video: str
-    reason: str
-    attempts: int
-    crashed: bool
-    log: str
+    run: str  # what its run folder would have been called
+    video: str  # the video
+    reason: str  # why, in a sentence
+    attempts: int  # how often it was begun
+    crashed: bool  # whether its process ended
+    log: str  # path of its log
 
 
 @dataclass(frozen=True)
 class BatchProgress:
-    """How far a batch is.
+    """How far a batch is."""
 
-    Attributes:
-        state: ``running``, ``finished`` or ``interrupted``.
-        total: Videos.
-        finished: Number of finished videos.
-        failed: Those that came to nothing.
-        before: Finished videos that were so before the command began.
-        running: By worker: the video, how many frames of how many, since when, at which attempt.
-        engine: The engine that runs them, in words.
-        workers: How many videos at a time.
-        began: When, in seconds since 1970.
-        updated: When this was written.
-        seconds_to_go: About how long it will take; None if unknown yet.
-    """
-
-    state: str
-    total: int
-    finished: int = 0
-    failed: int = 0
-    before: int = 0
+    state: str  # running, finished or interrupted
+    total: int  # videos
+    finished: int = 0  # number of finished videos
+    failed: int = 0  # those that came to nothing
+    before: int = 0  # finished videos that were so before the command began
+    # by worker: the video, how many frames of how many, since when, at which attempt
     running: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    engine: str = ""
-    workers: int = 0
-    began: float = 0.0
-    updated: float = 0.0
-    seconds_to_go: float | None = None
+    engine: str = ""  # the engine that runs them, in words
+    workers: int = 0  # how many videos at a time
+    began: float = 0.0  # when, in seconds since 1970
+    updated: float = 0.0  # when this was written
+    seconds_to_go: float | None = None  # about how long it will take; None if unknown yet
 
     @property
     def state_in_words(self) -> str:

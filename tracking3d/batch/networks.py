@@ -16,15 +16,10 @@ from tracking3d.results.files import write_atomic, writing
 
 @dataclass(frozen=True)
 class SharedNetwork:
-    """A network of the catalogue that a machine may lack.
+    """A network of the catalogue that a machine may lack."""
 
-    Attributes:
-        name: Its name there.
-        content: Its file.
-    """
-
-    name: str
-    content: Shared
+    name: str  # its name there
+    content: Shared  # its file
 
 
 def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetwork, ...]:

@@ -85,17 +85,11 @@ class VideoRow(Section):
 
 @dataclass(frozen=True)
 class UnusableRow:
-    """A row that cannot be used.
+    """A row that cannot be used."""
 
-    Attributes:
-        number: Its line.
-        video: Its video, as far as it can be printed.
-        reason: What is wrong with it, in a sentence that names the line.
-    """
-
-    number: int
-    video: str
-    reason: str
+    number: int  # its line
+    video: str  # its video, as far as it can be printed
+    reason: str  # what is wrong with it, in a sentence that names the line
 
 
 def read_row(values: Mapping[str, Any], where: str) -> VideoRow:

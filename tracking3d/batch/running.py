@@ -34,19 +34,12 @@ _PATIENCE = 20.0  # a file that takes long to write is written less often: so ma
 
 @dataclass(frozen=True)
 class Happening:
-    """Something that a scheduler or a person may want to know.
+    """Something that a scheduler or a person may want to know."""
 
-    Attributes:
-        event: ``began``, ``progress``, ``again``, ``finished`` or ``failed`` of a video; ``batch`` of all.
-        video: Name of the run folder; empty for all.
-        about: What belongs to it.
-        progress: How far the batch is.
-    """
-
-    event: str
-    video: str
-    about: Mapping[str, Any]
-    progress: BatchProgress
+    event: str  # began, progress, again, finished or failed of a video; batch of all
+    video: str  # name of the run folder; empty for all
+    about: Mapping[str, Any]  # what belongs to it
+    progress: BatchProgress  # how far the batch is
 
 
 Listener = Callable[[Happening], None]

@@ -14,39 +14,24 @@ from tracking3d.prompts.boxes import BoxFormat
 
 @dataclass(frozen=True)
 class VideoJob:
-    """What one worker does in one go: a video is decoded once, however many objects are tracked in it.
+    """What one worker does in one go: a video is decoded once, however many objects are tracked in it."""
 
-    Attributes:
-        name: Its run folder within that of the batch.
-        video: Video file, folder or pattern of images.
-        config: The pipeline.
-        box: Objects by their box in the first frame, as ``tracking3d run --box`` has them.
-        mask: Objects by the image file of their mask.
-        points: Objects by points.
-        correct: Corrections.
-        start_frame: The frame in which the objects are given; None for the first.
-        frames: ``START:STOP:STEP``.
-        sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
-        size: Bytes of the video, if known: large ones are begun first.
-        fault: Why it cannot be done, if known beforehand.
-        box_format: How boxes are written, in corrections too.
-        split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
-    """
-
-    name: str
-    video: str
-    config: PipelineConfig
-    box: tuple[str, ...] = ()
-    mask: tuple[str, ...] = ()
-    points: tuple[str, ...] = ()
-    correct: tuple[str, ...] = ()
-    start_frame: int | None = None
-    frames: str | None = None
+    name: str  # its run folder within that of the batch
+    video: str  # video file, folder or pattern of images
+    config: PipelineConfig  # the pipeline
+    box: tuple[str, ...] = ()  # objects by their box in the first frame, as tracking3d run --box has them
+    mask: tuple[str, ...] = ()  # objects by the image file of their mask
+    points: tuple[str, ...] = ()  # objects by points
+    correct: tuple[str, ...] = ()  # corrections
+    start_frame: int | None = None  # the frame in which the objects are given; None for the first
+    frames: str | None = None  # START:STOP:STEP
+    # layout, folder and name of a sequence of a dataset, whose images are then the video
     sequence: tuple[str, str, str] | None = None
-    size: int = 0
-    fault: str = ""
+    size: int = 0  # bytes of the video, if known: large ones are begun first
+    fault: str = ""  # why it cannot be done, if known beforehand
+    # length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none
     split: str = ""
-    box_format: BoxFormat = "xywh"
+    box_format: BoxFormat = "xywh"  # how boxes are written, in corrections too
 
     @property
     def in_parts(self) -> bool:

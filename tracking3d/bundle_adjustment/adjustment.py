@@ -30,17 +30,11 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Points of an object followed through F frames.
+    """Points of an object followed through F frames."""
 
-    Attributes:
-        pixels: ``(F, N, 2)`` in pixels of the full frame; anything where not visible.
-        visible: ``(F, N)`` bool.
-        weight: ``(F, N)`` how much each observation counts; all the same if None.
-    """
-
-    pixels: FloatArray
-    visible: NDArray[np.bool_]
-    weight: FloatArray | None = None
+    pixels: FloatArray  # (F, N, 2) in pixels of the full frame; anything where not visible
+    visible: NDArray[np.bool_]  # (F, N) bool
+    weight: FloatArray | None = None  # (F, N) how much each observation counts; all the same if None
 
     def weights(self) -> FloatArray:
         """``(F, N)`` weights, 0 wherever there is nothing to see: not visible, or a value that is not finite."""

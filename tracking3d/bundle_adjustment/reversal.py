@@ -19,15 +19,10 @@ _ROBUST_TURNS = 5
 
 @dataclass(frozen=True, eq=False)
 class Reversal:
-    """Depths negated about one point, the same in every view up to perspective.
+    """Depths negated about one point, the same in every view up to perspective."""
 
-    Attributes:
-        centre: ``(3,)`` in object coordinates; it stays where every view sees it.
-        direction: ``(3,)`` unit vector in object coordinates, along which points are negated.
-    """
-
-    centre: FloatArray
-    direction: FloatArray
+    centre: FloatArray  # (3,) in object coordinates; it stays where every view sees it
+    direction: FloatArray  # (3,) unit vector in object coordinates, along which points are negated
 
     def points(self, points: FloatArray) -> FloatArray:
         """``(N, 3)`` points reversed."""

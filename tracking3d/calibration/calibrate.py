@@ -32,38 +32,23 @@ _OUTLIER, _ROUNDS = 3.0, 3
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """The board in one frame.
+    """The board in one frame."""
 
-    Attributes:
-        index: The frame.
-        numbers: ``(N,)`` which corners are seen.
-        pixels: ``(N, 2)`` where.
-    """
-
-    index: int
-    numbers: NDArray[np.int64]
-    pixels: NDArray[np.float32]
+    index: int  # the frame
+    numbers: NDArray[np.int64]  # (N,) which corners are seen
+    pixels: NDArray[np.float32]  # (N, 2) where
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        camera: The camera.
-        error: Reprojection error in pixels, root mean square over all corners.
-        errors: The same of each view, by its frame.
-        coverage: Share of the picture's cells that a corner was seen in, see `CELLS`.
-        focal_deviation: Standard deviation of the focal length in pixels; None of a fisheye.
-        left_out: Why a frame has no part in it, by its index.
-    """
-
-    camera: CalibratedCamera
-    error: float
-    errors: dict[int, float]
-    coverage: float
-    focal_deviation: float | None
-    left_out: dict[int, str] = field(default_factory=dict)
+    camera: CalibratedCamera  # the camera
+    error: float  # reprojection error in pixels, root mean square over all corners
+    errors: dict[int, float]  # the same of each view, by its frame
+    coverage: float  # share of the picture's cells that a corner was seen in, see `CELLS`
+    focal_deviation: float | None  # standard deviation of the focal length in pixels; None of a fisheye
+    left_out: dict[int, str] = field(default_factory=dict)  # why a frame has no part in it, by its index
 
 
 def find_views(

@@ -12,21 +12,14 @@ from tracking3d.geometry.lens import COUNTS, Model, Pinhole
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """A camera from a calibration.
+    """A camera from a calibration."""
 
-    Attributes:
-        intrinsics: ``(fx, fy, cx, cy)`` in pixels; (0, 0) is the centre of the top-left pixel.
-        model: Formula of the distortion, see `tracking3d.geometry.lens`.
-        coefficients: Its coefficients; empty if there is none.
-        size: ``(width, height)`` in pixels of the pictures that it was measured with; None if not stated.
-        origin: Where it came from, in words.
-    """
-
-    intrinsics: Pinhole
-    model: Model = "radtan"
-    coefficients: tuple[float, ...] = ()
+    intrinsics: Pinhole  # (fx, fy, cx, cy) in pixels; (0, 0) is the centre of the top-left pixel
+    model: Model = "radtan"  # formula of the distortion, see `tracking3d.geometry.lens`
+    coefficients: tuple[float, ...] = ()  # its coefficients; empty if there is none
+    # (width, height) in pixels of the pictures that it was measured with; None if not stated
     size: tuple[int, int] | None = None
-    origin: str = "given camera"
+    origin: str = "given camera"  # where it came from, in words
 
     def for_frames(self, width: int, height: int) -> CalibratedCamera:
         """The same camera for pictures of another size, which must have the same proportions.

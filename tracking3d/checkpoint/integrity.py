@@ -24,17 +24,11 @@ from tracking3d.video.opencv_log import silent_opencv
 
 @dataclass(frozen=True, eq=False)
 class WholeLines:
-    """The lines of a ``frames.jsonl`` up to the first that is damaged.
+    """The lines of a ``frames.jsonl`` up to the first that is damaged."""
 
-    Attributes:
-        records: What they say.
-        ends: For each the bytes up to its end.
-        size: Bytes of the file.
-    """
-
-    records: tuple[FrameRecord, ...]
-    ends: tuple[int, ...]
-    size: int
+    records: tuple[FrameRecord, ...]  # what they say
+    ends: tuple[int, ...]  # for each the bytes up to its end
+    size: int  # bytes of the file
 
     @classmethod
     def of(cls, path: Path) -> WholeLines:

@@ -22,17 +22,11 @@ _NAME = re.compile(r"milestone_(\d{6,})\.json")
 
 @dataclass(frozen=True)
 class Milestone:
-    """The state after a frame.
+    """The state after a frame."""
 
-    Attributes:
-        taken: How many frames were taken until then.
-        path: The file of its text.
-        arrays: Names of the array files that it needs.
-    """
-
-    taken: int
-    path: Path
-    arrays: frozenset[str]
+    taken: int  # how many frames were taken until then
+    path: Path  # the file of its text
+    arrays: frozenset[str]  # names of the array files that it needs
 
     @property
     def bytes(self) -> int:

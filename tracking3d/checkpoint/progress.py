@@ -16,25 +16,15 @@ from tracking3d.frames import Frame, SkippedFrame
 
 @dataclass(frozen=True)
 class RunProgress:
-    """Progress of a run.
+    """Progress of a run."""
 
-    Attributes:
-        last: Index of the last frame that has its causal estimate; -1 before the first.
-        lines: Bytes of ``frames.jsonl`` up to there.
-        refining: Whether everything was solved once more.
-        last_refined: Index of the last frame that was refined; -1 before the first.
-        refined_lines: Bytes of the refined estimates up to there.
-        seconds: Wall time of the run up to there, pauses left out.
-        refinement_seconds: The same of the final refinement.
-    """
-
-    last: int = -1
-    lines: int = 0
-    refining: bool = False
-    last_refined: int = -1
-    refined_lines: int = 0
-    seconds: float = 0.0
-    refinement_seconds: float = 0.0
+    last: int = -1  # index of the last frame that has its causal estimate; -1 before the first
+    lines: int = 0  # bytes of frames.jsonl up to there
+    refining: bool = False  # whether everything was solved once more
+    last_refined: int = -1  # index of the last frame that was refined; -1 before the first
+    refined_lines: int = 0  # bytes of the refined estimates up to there
+    seconds: float = 0.0  # wall time of the run up to there, pauses left out
+    refinement_seconds: float = 0.0  # the same of the final refinement
 
     def __post_init__(self) -> None:
         for one in fields(self):
@@ -45,39 +35,24 @@ class RunProgress:
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """The journal's record of a tracked frame, with what ``frames.jsonl`` does not hold.
+    """The journal's record of a tracked frame, with what ``frames.jsonl`` does not hold."""
 
-    Attributes:
-        index: The frame's index in the source.
-        picture: Checksum of its image, see `checksum`.
-        score: Score of its initial mask; reason: of the same.
-        corrected: Whether the estimate was fed back to the mask tracker.
-        failure: Which plug-in failed at it, and why; empty if none did.
-    """
-
-    index: int
-    picture: int
-    score: float = 1.0
+    index: int  # the frame's index in the source
+    picture: int  # checksum of its image, see `checksum`
+    score: float = 1.0  # score of its initial mask; reason: of the same
     reason: str = ""
-    corrected: bool = False
-    failure: str = ""
+    corrected: bool = False  # whether the estimate was fed back to the mask tracker
+    failure: str = ""  # which plug-in failed at it, and why; empty if none did
 
 
 @dataclass(frozen=True)
 class SavedState:
-    """A run that was stopped.
+    """A run that was stopped."""
 
-    Attributes:
-        progress: Its progress.
-        session: The session's state, see `tracking3d.pipeline.session.Session.state_dict`.
-        taken: The frames that were taken, by index.
-        skipped: Those that were not.
-    """
-
-    progress: RunProgress
-    session: dict[str, Any]
-    taken: dict[int, JournalEntry] = field(default_factory=dict)
-    skipped: tuple[SkippedFrame, ...] = ()
+    progress: RunProgress  # its progress
+    session: dict[str, Any]  # the session's state, see `tracking3d.pipeline.session.Session.state_dict`
+    taken: dict[int, JournalEntry] = field(default_factory=dict)  # the frames that were taken, by index
+    skipped: tuple[SkippedFrame, ...] = ()  # those that were not
 
 
 def checksum(image: NDArray[np.uint8]) -> int:

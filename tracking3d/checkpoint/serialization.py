@@ -39,19 +39,12 @@ class NotSerializableError(TypeError):
 
 @dataclass(eq=False)
 class _Part:
-    """An object that is encoded already.
+    """An object that is encoded already."""
 
-    Attributes:
-        value: The object, held so that its identity is not given to another one.
-        text: Its JSON.
-        file: Its file, if it has one.
-        parts: Objects within it.
-    """
-
-    value: object
-    text: str
-    file: str | None = None
-    parts: list[_Part] = field(default_factory=list)
+    value: object  # the object, held so that its identity is not given to another one
+    text: str  # its JSON
+    file: str | None = None  # its file, if it has one
+    parts: list[_Part] = field(default_factory=list)  # objects within it
 
     def within(self) -> Iterator[_Part]:
         """This node and all within it, each once, or twice if one node names it twice."""

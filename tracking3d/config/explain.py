@@ -111,17 +111,11 @@ def unknown_key(
 
 @dataclass(frozen=True)
 class _Section:
-    """The section that a path leads to.
+    """The section that a path leads to."""
 
-    Attributes:
-        path: The path in dotted form.
-        model: The innermost model on the path.
-        choices: The models that the section's ``name`` chooses from, if it chooses.
-    """
-
-    path: str
-    model: type[BaseModel]
-    choices: Mapping[str, type[BaseModel]]
+    path: str  # the path in dotted form
+    model: type[BaseModel]  # the innermost model on the path
+    choices: Mapping[str, type[BaseModel]]  # the models that the section's name chooses from, if it chooses
 
     def of_another_choice(self, keys: Sequence[str], noun: str) -> str | None:
         """Explain that ``keys`` are settings of another choice than the present one, if they are."""

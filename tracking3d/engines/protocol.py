@@ -13,17 +13,11 @@ Tell = Callable[[Any], None]
 
 @dataclass(frozen=True)
 class Needs:
-    """What one task takes of a machine.
+    """What one task takes of a machine."""
 
-    Attributes:
-        threads: Processor cores, and the threads that libraries get in the worker.
-        memory: Megabytes; 0 if it is not to be considered.
-        gpus: Share of a GPU; for Ray, which hides GPUs from tasks that ask for none.
-    """
-
-    threads: int = 1
-    memory: float = 0.0
-    gpus: float = 0.0
+    threads: int = 1  # processor cores, and the threads that libraries get in the worker
+    memory: float = 0.0  # megabytes; 0 if it is not to be considered
+    gpus: float = 0.0  # share of a GPU; for Ray, which hides GPUs from tasks that ask for none
 
 
 ONE_CORE = Needs()
@@ -31,20 +25,15 @@ ONE_CORE = Needs()
 
 @dataclass(frozen=True)
 class Task:
-    """One call in a worker.
+    """One call in a worker."""
 
-    Attributes:
-        number: Unique within a batch.
-        function: A function of a module, called as ``function(tell, *arguments)``; its result is pickled.
-        arguments: Pickled too.
-        log: Gets what is printed, by native code too, and the last words of a process that dies.
-        environment: Variables that must be set before libraries are imported, such as those that choose kernels.
-    """
-
-    number: int
+    number: int  # unique within a batch
+    # a function of a module, called as function(tell, *arguments); its result is pickled
     function: Callable[..., Any]
-    arguments: tuple[Any, ...] = ()
+    arguments: tuple[Any, ...] = ()  # pickled too
+    # gets what is printed, by native code too, and the last words of a process that dies
     log: Path | None = None
+    # variables that must be set before libraries are imported, such as those that choose kernels
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -58,17 +47,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class Began:
-    """A task has begun.
+    """A task has begun."""
 
-    Attributes:
-        number: Number of the task.
-        worker: What the worker is called; a worker that is free has the name again.
-        attempt: 1, or more if it was tried before.
-    """
-
-    number: int
-    worker: str
-    attempt: int = 1
+    number: int  # number of the task
+    worker: str  # what the worker is called; a worker that is free has the name again
+    attempt: int = 1  # 1, or more if it was tried before
 
 
 @dataclass(frozen=True)
@@ -81,21 +64,13 @@ class Told:
 
 @dataclass(frozen=True)
 class Ended:
-    """A task has ended.
+    """A task has ended."""
 
-    Attributes:
-        number: Number of the task.
-        value: What the function returned; None if it came to nothing.
-        fault: Why it came to nothing; None if it did not.
-        attempts: How often it was begun.
-        again: Whether it will be tried once more.
-    """
-
-    number: int
-    value: Any = None
-    fault: Fault | None = None
-    attempts: int = 1
-    again: bool = False
+    number: int  # number of the task
+    value: Any = None  # what the function returned; None if it came to nothing
+    fault: Fault | None = None  # why it came to nothing; None if it did not
+    attempts: int = 1  # how often it was begun
+    again: bool = False  # whether it will be tried once more
 
 
 Event = Began | Told | Ended
@@ -110,15 +85,10 @@ class Shared(Protocol):
 
 
 class Engine(Protocol):
-    """Calls functions in workers, several at a time. A worker that dies costs the task that it was at only.
+    """Calls functions in workers, several at a time. A worker that dies costs the task that it was at only."""
 
-    Attributes:
-        name: What it is called.
-        workers: How many tasks it takes at a time.
-    """
-
-    name: str
-    workers: int
+    name: str  # what it is called
+    workers: int  # how many tasks it takes at a time
 
     def start(self, task: Task) -> None:
         """Begin a task; there are fewer than `workers` of them."""

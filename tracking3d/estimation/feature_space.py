@@ -34,19 +34,12 @@ _LEAST_PIXELS = 16  # in the mask, for a principal component analysis to mean an
 
 @dataclass(frozen=True, eq=False)
 class FeatureSpace:
-    """A linear map of feature channels.
+    """A linear map of feature channels."""
 
-    Attributes:
-        mean: ``(C,)`` what is taken off.
-        components: ``(K, C)`` what it is multiplied by afterwards.
-        kept: Share of the variance inside the first mask that is kept, in [0, 1].
-        contrast: Factor of a last channel, see `contrast_of`; 0 without it.
-    """
-
-    mean: Tensor
-    components: Tensor
-    kept: float = 1.0
-    contrast: float = 0.0
+    mean: Tensor  # (C,) what is taken off
+    components: Tensor  # (K, C) what it is multiplied by afterwards
+    kept: float = 1.0  # share of the variance inside the first mask that is kept, in [0, 1]
+    contrast: float = 0.0  # factor of a last channel, see `contrast_of`; 0 without it
 
     @classmethod
     def of(cls, features: Tensor, mask: Tensor, channels: int) -> FeatureSpace:

@@ -11,30 +11,20 @@ from tracking3d.frames import Frame, MaskEstimate
 
 @dataclass(frozen=True)
 class ModelCoverage:
-    """The part of a video that a model explains.
+    """The part of a video that a model explains."""
 
-    Attributes:
-        confidence: Of each frame that was estimated with it, by index.
-        anchors: Keyframes of which the pose is reliable: the object can be tracked from there.
-    """
-
-    confidence: Mapping[int, float]
-    anchors: frozenset[int]
+    confidence: Mapping[int, float]  # of each frame that was estimated with it, by index
+    anchors: frozenset[int]  # keyframes of which the pose is reliable: the object can be tracked from there
 
 
 @dataclass(frozen=True, eq=False)
 class Gap:
-    """Consecutive frames, some of which the object's model does not explain, next to a keyframe.
+    """Consecutive frames, some of which the object's model does not explain, next to a keyframe."""
 
-    Attributes:
-        anchor: The keyframe's frame.
-        frames: The frames with their initial masks, the nearest to ``anchor`` first; they can be iterated once.
-        backwards: Whether they come before ``anchor``.
-    """
-
-    anchor: Frame
+    anchor: Frame  # the keyframe's frame
+    # the frames with their initial masks, the nearest to anchor first; they can be iterated once
     frames: Iterable[tuple[Frame, MaskEstimate]]
-    backwards: bool
+    backwards: bool  # whether they come before anchor
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,11 @@ class KnownObject:
 
     Solvers have it with its middle at the origin and a radius of `tracking3d.estimation.prototype_start.RADIUS`, since
     their tolerances are made for that; what they answer is turned back into the object's own coordinates and unit.
-
-    Attributes:
-        name: What sentences call it.
-        model: In its own coordinates; ``texture_weight`` is 0 if its colours are not known.
-        camera: The camera that it was learnt with; None if there was none.
     """
 
-    name: str
-    model: ObjectModel
-    camera: Camera | None = None
+    name: str  # what sentences call it
+    model: ObjectModel  # in its own coordinates; texture_weight is 0 if its colours are not known
+    camera: Camera | None = None  # the camera that it was learnt with; None if there was none
 
     @property
     def has_colours(self) -> bool:

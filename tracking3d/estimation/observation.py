@@ -25,30 +25,18 @@ _HULL_SHARE = 0.4  # of the distance to the mask's convex hull behind an occlude
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A window of one frame, ``S`` x ``S`` pixels.
+    """A window of one frame, ``S`` x ``S`` pixels."""
 
-    Attributes:
-        index: The frame's index in the source.
-        window: Where in the frame.
-        K: ``(3, 3)`` the camera's intrinsics in the window.
-        image: ``(3, 2 S, 2 S)`` RGB in [0, 1], finer than the rest: it becomes the visible texture.
-        features: ``(C, S, S)``.
-        valid: ``(S, S)`` 1 inside the frame, 0 beyond its border, where nothing is known.
-        mask: ``(S, S)`` rough mask in [0, 1]; all zero if there is none.
-        distance: ``(S, S)`` distance to the mask in NDC, zero inside it.
-        has_mask: Whether the mask tracker gave a mask.
-        occluder: ``(S, S)`` in [0, 1], what is known to be in front of the object; None if nothing is known.
-    """
-
-    index: int
-    window: Window
-    K: Tensor
-    image: Tensor
-    features: Tensor
-    valid: Tensor
-    mask: Tensor
-    distance: Tensor
-    has_mask: bool
+    index: int  # the frame's index in the source
+    window: Window  # where in the frame
+    K: Tensor  # (3, 3) the camera's intrinsics in the window
+    image: Tensor  # (3, 2 S, 2 S) RGB in [0, 1], finer than the rest: it becomes the visible texture
+    features: Tensor  # (C, S, S)
+    valid: Tensor  # (S, S) 1 inside the frame, 0 beyond its border, where nothing is known
+    mask: Tensor  # (S, S) rough mask in [0, 1]; all zero if there is none
+    distance: Tensor  # (S, S) distance to the mask in NDC, zero inside it
+    has_mask: bool  # whether the mask tracker gave a mask
+    # (S, S) in [0, 1], what is known to be in front of the object; None if nothing is known
     occluder: Tensor | None = None
 
     @cached_property

@@ -29,17 +29,11 @@ _ELONGATED = 1.1  # ratio of an ellipse's axes from which its direction is known
 
 @dataclass(frozen=True, eq=False)
 class MaskEllipse:
-    """The ellipse with a mask's second moments, in pixels of the full frame.
+    """The ellipse with a mask's second moments, in pixels of the full frame."""
 
-    Attributes:
-        centre: ``(2,)``.
-        semi_axes: ``(2,)``, the longer first.
-        directions: ``(2, 2)``, columns are the axes' unit directions.
-    """
-
-    centre: NDArray[np.float64]
-    semi_axes: NDArray[np.float64]
-    directions: NDArray[np.float64]
+    centre: NDArray[np.float64]  # (2,)
+    semi_axes: NDArray[np.float64]  # (2,), the longer first
+    directions: NDArray[np.float64]  # (2, 2), columns are the axes' unit directions
 
 
 def first_mask(frame: Frame, mask: MaskEstimate) -> NDArray[np.bool_]:

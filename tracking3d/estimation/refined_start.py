@@ -23,20 +23,13 @@ class RefinedStart:
 
     The refinement may have rotated and scaled the object and changed the focal length; frames whose estimates stay have
     both poses, which tell how a causal pose is to be changed.
-
-    Attributes:
-        camera: The camera of the refined poses.
-        vertices: ``(V, 3)`` the refined surface, with the topology of the solver's.
-        refined: ``(4, 4)`` refined poses by frame index, of at least `LEAST_FRAMES` frames.
-        causal: The same frames' causal poses.
-        focal: The focal length in pixels that each causal pose belongs to.
     """
 
-    camera: Camera
-    vertices: NDArray[np.float64]
-    refined: Mapping[int, _Pose]
-    causal: Mapping[int, _Pose]
-    focal: Mapping[int, float]
+    camera: Camera  # the camera of the refined poses
+    vertices: NDArray[np.float64]  # (V, 3) the refined surface, with the topology of the solver's
+    refined: Mapping[int, _Pose]  # (4, 4) refined poses by frame index, of at least `LEAST_FRAMES` frames
+    causal: Mapping[int, _Pose]  # the same frames' causal poses
+    focal: Mapping[int, float]  # the focal length in pixels that each causal pose belongs to
 
     @cached_property
     def scale(self) -> float:

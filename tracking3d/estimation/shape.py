@@ -15,21 +15,13 @@ _MAX_ROUNDS = 12  # of smoothing a fold (chosen)
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The fixed part of the object: prototype, topology and atlas.
+    """The fixed part of the object: prototype, topology and atlas."""
 
-    Attributes:
-        rest: ``(V, 3)`` vertices of the prototype.
-        faces: ``(F, 3)`` int64.
-        face_uvs: ``(F, 3, 2)``.
-        laplacian: Sparse ``(V, V)``.
-        flat: Whether all vertices stay in one plane.
-    """
-
-    rest: Tensor
-    faces: Tensor
-    face_uvs: Tensor
-    laplacian: Tensor
-    flat: bool
+    rest: Tensor  # (V, 3) vertices of the prototype
+    faces: Tensor  # (F, 3) int64
+    face_uvs: Tensor  # (F, 3, 2)
+    laplacian: Tensor  # sparse (V, V)
+    flat: bool  # whether all vertices stay in one plane
 
     @classmethod
     def of(cls, mesh: Mesh, flat: bool, device: torch.device) -> Shape:

@@ -19,17 +19,11 @@ from tracking3d.geometry.pose import Pose
 
 @dataclass(frozen=True)
 class SolverBase:
-    """The fields that every solver has.
+    """The fields that every solver has."""
 
-    Attributes:
-        config: The pipeline's configuration.
-        camera: The camera of the full frame.
-        encoder: The feature encoder.
-    """
-
-    config: PipelineConfig
-    camera: Camera
-    encoder: FeatureEncoder
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame
+    encoder: FeatureEncoder  # the feature encoder
 
     @property
     def device(self) -> torch.device:

@@ -21,32 +21,22 @@ ANYWHERE = frozenset({"answers"})
 
 @dataclass(frozen=True)
 class Exporter:
-    """One format.
+    """One format."""
 
-    Attributes:
-        name: What selects it.
-        kind: What it is about: ``poses``, ``cameras``, ``masks``, ``probabilities``, ``points``, ``model`` or
-            ``scene``.
-        writes: What it writes, in a few words.
-        write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
-        suffix: Suffix of the file; empty if a folder is written.
-        file_name: Name of the file without its suffix in the folder of exports: ``{run}`` stands for the name of the
-            run, ``{letters}`` for the letters and digits of that name; the name of the run if this is empty. A
-            folder has the format's name.
-        options: Names of those `ExportOptions` that it has a use for, besides `ANYWHERE`.
-        modules: What has to be importable, besides what tracking3d always needs.
-        extra: What brings them: the name of an extra of this package.
-    """
-
-    name: str
-    kind: str
-    writes: str
+    name: str  # what selects it
+    kind: str  # what it is about: poses, cameras, masks, probabilities, points, model or scene
+    writes: str  # what it writes, in a few words
+    # writes a run to a path that does not exist yet: a file if there is a suffix, else a folder
     write: Callable[[ExportedRun, Path], object]
-    suffix: str = ""
+    suffix: str = ""  # suffix of the file; empty if a folder is written
+    # Name of the file without its suffix in the folder of exports: {run} stands for the name of the run,
+    # {letters} for the letters and digits of that name; the name of the run if this is empty. A folder has
+    # the format's name.
     file_name: str = ""
+    # names of those `ExportOptions` that it has a use for, besides `ANYWHERE`
     options: frozenset[str] = field(default=frozenset())
-    modules: tuple[str, ...] = ()
-    extra: str = ""
+    modules: tuple[str, ...] = ()  # what has to be importable, besides what tracking3d always needs
+    extra: str = ""  # what brings them: the name of an extra of this package
 
     def default_name(self, run: ExportedRun) -> str:
         """The name of the file or folder in the folder of exports of a run."""

@@ -57,24 +57,16 @@ _NAMED = {
 
 @dataclass(frozen=True)
 class Export:
-    """What was exported.
+    """What was exported."""
 
-    Attributes:
-        path: The file or folder.
-        unit: The unit of lengths, in words; None if the format has none.
-        frames: How many frames have what the format is about, a pose or a mask; of a model, those it is of.
-        without: Frames between the first and the last that have none: skipped, and of poses, lost.
-        not_finished: A sentence about a run that has not come to its end; empty for one that has.
-        of_model: Whether it is the model and nothing of single frames.
-        note: A sentence about images that are left out, or a video that was given in vain; empty if there is none.
-    """
-
-    path: Path
-    unit: str | None
-    frames: int
+    path: Path  # the file or folder
+    unit: str | None  # the unit of lengths, in words; None if the format has none
+    frames: int  # how many frames have what the format is about, a pose or a mask; of a model, those it is of
+    # frames between the first and the last that have none: skipped, and of poses, lost
     without: tuple[int, ...]
-    not_finished: str = ""
-    of_model: bool = False
+    not_finished: str = ""  # a sentence about a run that has not come to its end; empty for one that has
+    of_model: bool = False  # whether it is the model and nothing of single frames
+    # a sentence about images that are left out, or a video that was given in vain; empty if there is none
     note: str = ""
 
     @property

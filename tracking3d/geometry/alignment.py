@@ -36,17 +36,11 @@ _RANK = 1e-6  # a direction whose singular value is this small relative to the l
 
 @dataclass(frozen=True, eq=False)
 class ObjectAlignment:
-    """How an estimated object frame lies in the true one; see the module.
+    """How an estimated object frame lies in the true one; see the module."""
 
-    Attributes:
-        A: ``(3, 3)`` rotation from the true to the estimated object frame.
-        scale: Length of the estimate's unit in that of the truth.
-        offset: ``(3,)`` the true origin in the estimated object frame and unit.
-    """
-
-    A: NDArray[np.float64]
-    scale: float
-    offset: NDArray[np.float64]
+    A: NDArray[np.float64]  # (3, 3) rotation from the true to the estimated object frame
+    scale: float  # length of the estimate's unit in that of the truth
+    offset: NDArray[np.float64]  # (3,) the true origin in the estimated object frame and unit
 
     @property
     def T_true_est(self) -> NDArray[np.float64]:

@@ -21,16 +21,11 @@ class Similarity:
     """From the second object's coordinates to the first's.
 
     One camera cannot tell size from distance, so that the cameras' distances go with the scale.
-
-    Attributes:
-        R: ``(3, 3)`` rotation.
-        scale: Length of the second's unit in that of the first.
-        translation: ``(3,)`` in the first's unit.
     """
 
-    R: Array
-    scale: float
-    translation: Array
+    R: Array  # (3, 3) rotation
+    scale: float  # length of the second's unit in that of the first
+    translation: Array  # (3,) in the first's unit
 
     @classmethod
     def identity(cls) -> Similarity:

@@ -48,17 +48,11 @@ class TexturedMesh(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class RenderedViews:
-    """What a mesh looks like in B frames.
+    """What a mesh looks like in B frames."""
 
-    Attributes:
-        image: ``(B, C, H, W)`` texture, zero where uncovered.
-        silhouette: ``(B, 1, H, W)`` soft, in [0, 1].
-        drawn: All that the renderer returns.
-    """
-
-    image: Tensor
-    silhouette: Tensor
-    drawn: Rendering
+    image: Tensor  # (B, C, H, W) texture, zero where uncovered
+    silhouette: Tensor  # (B, 1, H, W) soft, in [0, 1]
+    drawn: Rendering  # all that the renderer returns
 
     @property
     def depth(self) -> Tensor:

@@ -28,37 +28,24 @@ class Point(_Drawn):
 
 
 class Stroke(_Drawn):
-    """A line of the brush.
+    """A line of the brush."""
 
-    Attributes:
-        path: Its points ``(x, y)`` in pixels.
-        radius: Radius of the brush, in pixels.
-        on: Whether it adds to the mask, or takes away from it.
-    """
-
+    # its points (x, y) in pixels
     path: Annotated[tuple[tuple[Pixel, Pixel], ...], Field(min_length=1, max_length=LONGEST_STROKE)]
-    radius: Extent
-    on: bool
+    radius: Extent  # radius of the brush, in pixels
+    on: bool  # whether it adds to the mask, or takes away from it
 
 
 class DrawnObject(_Drawn):
-    """One object.
+    """One object."""
 
-    Attributes:
-        name: What the person calls it.
-        colour: ``#rrggbb`` in which it is shown.
-        frame: Index of the frame that it was drawn on.
-        box: ``(x, y, width, height)`` in pixels, or None.
-        points: The clicks.
-        strokes: The paint, in order.
-    """
-
-    name: Annotated[str, Field(min_length=1, max_length=40)]
+    name: Annotated[str, Field(min_length=1, max_length=40)]  # what the person calls it
+    # #rrggbb in which it is shown
     colour: Annotated[str, Field(pattern=r"^#[0-9a-f]{6}$")]
-    frame: Annotated[int, Field(ge=0, le=2**31)]
-    box: tuple[Pixel, Pixel, Extent, Extent] | None = None
-    points: Annotated[tuple[Point, ...], Field(max_length=MOST_POINTS)] = ()
-    strokes: Annotated[tuple[Stroke, ...], Field(max_length=MOST_STROKES)] = ()
+    frame: Annotated[int, Field(ge=0, le=2**31)]  # index of the frame that it was drawn on
+    box: tuple[Pixel, Pixel, Extent, Extent] | None = None  # (x, y, width, height) in pixels, or None
+    points: Annotated[tuple[Point, ...], Field(max_length=MOST_POINTS)] = ()  # the clicks
+    strokes: Annotated[tuple[Stroke, ...], Field(max_length=MOST_STROKES)] = ()  # the paint, in order
 
     @field_validator("name")
     @classmethod

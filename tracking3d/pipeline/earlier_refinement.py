@@ -25,19 +25,12 @@ _ROUNDING = 1e-6  # by which poses of equal estimates differ
 
 @dataclass(frozen=True, eq=False)
 class EarlierRefinement:
-    """The refined estimates that stand.
+    """The refined estimates that stand."""
 
-    Attributes:
-        folder: The run folder that they are in.
-        start: Their poses, and the surface.
-        kept: Their records by frame index.
-        changed: Indices of the other frames, ascending.
-    """
-
-    folder: Path
-    start: RefinedStart
-    kept: Mapping[int, FrameRecord]
-    changed: tuple[int, ...]
+    folder: Path  # the run folder that they are in
+    start: RefinedStart  # their poses, and the surface
+    kept: Mapping[int, FrameRecord]  # their records by frame index
+    changed: tuple[int, ...]  # indices of the other frames, ascending
 
     @cached_property
     def near(self) -> frozenset[int]:

@@ -14,14 +14,10 @@ class FrameOrder:
 
     A solver takes frames for one after the other and counts the time between them by their indices. Frames from
     before the first one come when the last one is done; they are numbered on from there, so that time increases.
-
-    Attributes:
-        first: Index of the first frame.
-        last: Index of the last frame forwards; None until it is known.
     """
 
-    first: int
-    last: int | None = None
+    first: int  # index of the first frame
+    last: int | None = None  # index of the last frame forwards; None until it is known
 
     def number_of(self, index: int) -> int:
         """The number of the frame with an index."""

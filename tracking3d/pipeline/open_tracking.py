@@ -39,21 +39,13 @@ class NoFrameError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class TrackRequest:
-    """What is to be tracked, checked as far as possible before the first frame is read; see `request_tracking`.
+    """What is to be tracked, checked as far as possible before the first frame is read; see `request_tracking`."""
 
-    Attributes:
-        source: The frames.
-        config: The pipeline; its mask tracker may be ``auto``.
-        prompts: The objects in the prompt frame.
-        corrections: For each object, corrections by frame index.
-        skip_damaged: Whether frames that cannot be decoded are skipped until the first that can.
-    """
-
-    source: FrameSource
-    config: PipelineConfig
-    prompts: PromptSet
-    corrections: Sequence[Mapping[int, Correction]]
-    skip_damaged: bool = False
+    source: FrameSource  # the frames
+    config: PipelineConfig  # the pipeline; its mask tracker may be auto
+    prompts: PromptSet  # the objects in the prompt frame
+    corrections: Sequence[Mapping[int, Correction]]  # for each object, corrections by frame index
+    skip_damaged: bool = False  # whether frames that cannot be decoded are skipped until the first that can
 
 
 def request_tracking(
@@ -88,17 +80,12 @@ def request_tracking(
 
 @dataclass(frozen=True, eq=False)
 class TrackedObject:
-    """One object of a tracking.
+    """One object of a tracking."""
 
-    Attributes:
-        session: Estimates the object in each frame.
-        prompt: The object in the prompt frame; None if the mask tracker or an earlier run knows it.
-        corrections: What the object is in later frames, by their index.
-    """
-
-    session: Session
+    session: Session  # estimates the object in each frame
+    # the object in the prompt frame; None if the mask tracker or an earlier run knows it
     prompt: Prompt | None
-    corrections: Mapping[int, Correction]
+    corrections: Mapping[int, Correction]  # what the object is in later frames, by their index
 
     def step(self, frame: Frame, coming: Frame | None = None) -> FrameEstimate:
         """Estimate the object in the next frame.
@@ -116,25 +103,16 @@ class TrackedObject:
 
 @dataclass(frozen=True, eq=False)
 class OpenTracking:
-    """A tracking of which the first frame is read and no frame is estimated yet.
+    """A tracking of which the first frame is read and no frame is estimated yet."""
 
-    Attributes:
-        source: The frames' source.
-        config: The pipeline; its mask tracker is never ``auto``.
-        tracker_choice: Why the mask tracker stands in for ``auto``; None if the user named it.
-        start_frame: Index of the prompt frame if frames come both ways from it; else None.
-        first: The prompt frame.
-        frames: All frames in the order in which they are tracked; those skipped before ``first`` come first.
-        objects: The objects, in the order of their prompts.
-    """
-
-    source: FrameSource
-    config: PipelineConfig
-    tracker_choice: str | None
-    start_frame: int | None
-    first: Frame
+    source: FrameSource  # the frames' source
+    config: PipelineConfig  # the pipeline; its mask tracker is never auto
+    tracker_choice: str | None  # why the mask tracker stands in for auto; None if the user named it
+    start_frame: int | None  # index of the prompt frame if frames come both ways from it; else None
+    first: Frame  # the prompt frame
+    # all frames in the order in which they are tracked; those skipped before first come first
     frames: Iterator[Frame | SkippedFrame]
-    objects: tuple[TrackedObject, ...]
+    objects: tuple[TrackedObject, ...]  # the objects, in the order of their prompts
 
 
 @contextmanager

@@ -47,21 +47,15 @@ Decision = tuple[Frame, SegmentedMask | None]
 
 @dataclass(frozen=True, eq=False)
 class PrecomputedRefinement:
-    """What the last steps come to, if other processes have taken them.
+    """What the last steps come to, if other processes have taken them."""
 
-    Attributes:
-        look: What all frames together say of poses, surface and lens.
-        estimates: The estimates with adjusted poses, by frame index.
-        masks: The masks that were decided, as PNG, by index; their probabilities are written.
-        retracked: The masks of frames that were estimated again after the adjustment, as PNG, by index.
-        kept_masks: Number of masks that were not segmented again because nothing contradicts them.
-    """
-
-    look: GlobalAdjustment
-    estimates: Mapping[int, FrameRecord]
+    look: GlobalAdjustment  # what all frames together say of poses, surface and lens
+    estimates: Mapping[int, FrameRecord]  # the estimates with adjusted poses, by frame index
+    # the masks that were decided, as PNG, by index; their probabilities are written
     masks: Mapping[int, bytes]
+    # the masks of frames that were estimated again after the adjustment, as PNG, by index
     retracked: Mapping[int, bytes]
-    kept_masks: int = 0
+    kept_masks: int = 0  # number of masks that were not segmented again because nothing contradicts them
 
 
 class Retracking:

@@ -14,15 +14,10 @@ from tracking3d.results.refined_estimates import RefinedEstimates
 
 @dataclass(frozen=True, eq=False)
 class SavedMasks:
-    """What the mask tracker gave for each frame.
+    """What the mask tracker gave for each frame."""
 
-    Attributes:
-        estimates: The estimates of the run, in whose folder the masks are.
-        initial: Score and reason of every frame's initial mask, by index.
-    """
-
-    estimates: RefinedEstimates
-    initial: Mapping[int, tuple[float, str]]
+    estimates: RefinedEstimates  # the estimates of the run, in whose folder the masks are
+    initial: Mapping[int, tuple[float, str]]  # score and reason of every frame's initial mask, by index
 
     def has_mask(self, index: int) -> bool:
         """Whether the mask tracker saw the object in a frame."""

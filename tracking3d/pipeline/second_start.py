@@ -33,17 +33,11 @@ _MIN_GAIN = 1.1  # times as many frames as the first start's must be explained
 
 @dataclass(frozen=True)
 class SecondStart:
-    """What came of a second start.
+    """What came of a second start."""
 
-    Attributes:
-        frame: Index of the frame that it was made with.
-        explained: How many frames have a reliable pose by it.
-        explained_before: How many have one by the first start.
-    """
-
-    frame: int
-    explained: int
-    explained_before: int
+    frame: int  # index of the frame that it was made with
+    explained: int  # how many frames have a reliable pose by it
+    explained_before: int  # how many have one by the first start
 
     @property
     def is_better(self) -> bool:

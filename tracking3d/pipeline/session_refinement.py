@@ -34,19 +34,12 @@ from tracking3d.runtime.stage_times import StageTimes, measure
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What another start comes to.
+    """What another start comes to."""
 
-    Attributes:
-        state: The solver's state after the last frame.
-        order: The order in which the solver was shown the frames.
-        poses: The pose ``(4, 4)`` in each frame, by index.
-        confidence: Of these poses.
-    """
-
-    state: Any
-    order: FrameOrder
-    poses: Mapping[int, NDArray[np.float64]]
-    confidence: Mapping[int, float]
+    state: Any  # the solver's state after the last frame
+    order: FrameOrder  # the order in which the solver was shown the frames
+    poses: Mapping[int, NDArray[np.float64]]  # the pose (4, 4) in each frame, by index
+    confidence: Mapping[int, float]  # of these poses
 
 
 class SessionRefinement:

@@ -28,23 +28,14 @@ _USUAL = 0.3072  # megapixels, 640 x 480
 
 @dataclass(frozen=True)
 class TrackerCandidate:
-    """A mask tracker that was measured.
+    """A mask tracker that was measured."""
 
-    Attributes:
-        name: Name of the plug-in.
-        what: What sentences call it.
-        iou: Mean IoU with true masks over the four real clips, see docs/masks.md.
-        seconds: Processor time of a frame of 640 x 480 pixels, from the same page.
-        networks: Known networks that it needs.
-        options: Its options.
-    """
-
-    name: str
-    what: str
-    iou: float
-    seconds: float
-    networks: tuple[str, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)
+    name: str  # name of the plug-in
+    what: str  # what sentences call it
+    iou: float  # mean IoU with true masks over the four real clips, see docs/masks.md
+    seconds: float  # processor time of a frame of 640 x 480 pixels, from the same page
+    networks: tuple[str, ...] = ()  # known networks that it needs
+    options: dict[str, Any] = field(default_factory=dict)  # its options
 
     def cost(self, size: tuple[int, int]) -> float:
         """Seconds of a frame of ``(height, width)`` pixels."""

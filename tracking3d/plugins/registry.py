@@ -31,27 +31,18 @@ _MASKS_GIVEN = "precomputed"
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """Description of one registered plug-in.
+    """Description of one registered plug-in."""
 
-    Attributes:
-        name: The name that selects it.
-        group: Its entry-point group.
-        package: The distribution that registers it, or ``TRACKING3D_PLUGINS``.
-        version: The distribution's version, or a short hash of the file of a module under development; empty if
-            unknown.
-        status: ``duplicate`` means that another plug-in has the name already, ``needs weights`` that its network has to
-            be downloaded or named first.
-        reason: Why the status is not ``ok``.
-        options: JSON schema of its options, if the status is ``ok``.
-    """
-
-    name: str
-    group: str
-    package: str
+    name: str  # the name that selects it
+    group: str  # its entry-point group
+    package: str  # the distribution that registers it, or TRACKING3D_PLUGINS
+    # the distribution's version, or a short hash of the file of a module under development; empty if unknown
     version: str
+    # duplicate means that another plug-in has the name already, needs weights that its network has to be
+    # downloaded or named first
     status: Literal["ok", "broken", "duplicate", "needs weights"]
-    reason: str = ""
-    options: dict[str, Any] | None = None
+    reason: str = ""  # why the status is not ok
+    options: dict[str, Any] | None = None  # JSON schema of its options, if the status is ok
 
 
 def list_plugins(build: bool = False) -> list[PluginInfo]:

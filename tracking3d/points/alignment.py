@@ -28,19 +28,12 @@ _LEAST_SHARED = 64  # points for which another thread pays
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """What N patches say.
+    """What N patches say."""
 
-    Attributes:
-        shift: ``(N, 2)`` pixels by which the image lies beside the template; 0 if there was nothing to align.
-        covariance: ``(N, 3)`` of it, xx, xy and yy in squared pixels; infinite there.
-        agreement: ``(N,)`` correlation of the two patches at the end, -1 there.
-        contrast: ``(N,)`` deviation of the template's grey values, 0 there.
-    """
-
-    shift: Array
-    covariance: Array
-    agreement: Array
-    contrast: Array
+    shift: Array  # (N, 2) pixels by which the image lies beside the template; 0 if there was nothing to align
+    covariance: Array  # (N, 3) of it, xx, xy and yy in squared pixels; infinite there
+    agreement: Array  # (N,) correlation of the two patches at the end, -1 there
+    contrast: Array  # (N,) deviation of the template's grey values, 0 there
 
     @property
     def variance(self) -> Array:

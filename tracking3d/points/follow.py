@@ -25,24 +25,16 @@ _UNLIKE = 0.2  # likeness below which something else is in front
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """N points in T views, in pixels of the frames.
+    """N points in T views, in pixels of the frames."""
 
-    Attributes:
-        positions: ``(T, N, 2)``; NaN for points beside the object, and where there is no view.
-        visible: ``(T, N)`` bool.
-        uncertainty: ``(T, N)`` pixels within twice which a position is right in some 19 of 20 cases; NaN if there is
-            no position.
-        measured: ``(T, N)`` bool: whether the image had a say.
-        points: ``(N, 3)`` in object coordinates; NaN for points beside the object.
-        features: ``(T, N, F)`` what the uncertainty is estimated from, see
-            `tracking3d.points.uncertainty.error_features`; NaN if there is no position.
-    """
-
-    positions: Array
-    visible: NDArray[np.bool_]
+    positions: Array  # (T, N, 2); NaN for points beside the object, and where there is no view
+    visible: NDArray[np.bool_]  # (T, N) bool
+    # (T, N) pixels within twice which a position is right in some 19 of 20 cases; NaN if there is no position
     uncertainty: Array
-    measured: NDArray[np.bool_]
-    points: Array
+    measured: NDArray[np.bool_]  # (T, N) bool: whether the image had a say
+    points: Array  # (N, 3) in object coordinates; NaN for points beside the object
+    # (T, N, F) what the uncertainty is estimated from, see `tracking3d.points.uncertainty.error_features`;
+    # NaN if there is no position
     features: Array
 
 

@@ -48,22 +48,15 @@ _MOST_KEPT = 32  # pictures that templates are kept of
 
 @dataclass(frozen=True, eq=False)
 class ImageTracks:
-    """N points in T pictures.
+    """N points in T pictures."""
 
-    Attributes:
-        positions: ``(T, N, 2)`` pixels; where a point is not found, where it would be by what is around it. NaN where
-            there is no picture.
-        visible: ``(T, N)`` bool: whether it was found.
-        uncertainty: ``(T, N)`` pixels within twice which a position is right in some 19 of 20 cases.
-        likeness: ``(T, N)`` correlation with the best template; -1 where none was found.
-        variance: ``(T, N)`` squared pixels: those of all placements on the way there added up.
-    """
-
+    # (T, N, 2) pixels; where a point is not found, where it would be by what is around it. NaN where there is
+    # no picture.
     positions: Array
-    visible: NDArray[np.bool_]
-    uncertainty: Array
-    likeness: Array
-    variance: Array
+    visible: NDArray[np.bool_]  # (T, N) bool: whether it was found
+    uncertainty: Array  # (T, N) pixels within twice which a position is right in some 19 of 20 cases
+    likeness: Array  # (T, N) correlation with the best template; -1 where none was found
+    variance: Array  # (T, N) squared pixels: those of all placements on the way there added up
 
 
 @dataclass(eq=False)

@@ -53,40 +53,27 @@ Corners = tuple[NDArray[np.int64], Array, Array]
 
 @dataclass(frozen=True)
 class LandmarkSupport:
-    """What landmarks say of a view's pose.
+    """What landmarks say of a view's pose."""
 
-    Attributes:
-        followed: How many of them were found in the view.
-        agreeing: How many of those where surface and pose put them; 0 if they were too few to be asked.
-    """
-
-    followed: int
-    agreeing: int
+    followed: int  # how many of them were found in the view
+    agreeing: int  # how many of those where surface and pose put them; 0 if they were too few to be asked
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkScene:
-    """A rigid surface in T views.
+    """A rigid surface in T views."""
 
-    Attributes:
-        views: None if the object was not found.
-        vertices: ``(V, 3)`` in object coordinates.
-        faces: ``(F, 3)``.
-        focal_factor: By which the views' focal lengths are those that they were opened with.
-        focal_deviation: Standard deviation of the logarithm of the focal length; None before it is estimated.
-        support: What landmarks say of each view's pose; empty before they were looked for.
-        may_reverse: Whether depth may be the other way round than the run has it; no longer once that is clear.
-        reversal: What was done to surface and poses, where landmarks said that it was.
-    """
-
-    views: list[SurfaceView | None]
-    vertices: Array
-    faces: NDArray[np.int64]
-    focal_factor: float = 1.0
+    views: list[SurfaceView | None]  # none if the object was not found
+    vertices: Array  # (V, 3) in object coordinates
+    faces: NDArray[np.int64]  # (F, 3)
+    focal_factor: float = 1.0  # by which the views' focal lengths are those that they were opened with
+    # standard deviation of the logarithm of the focal length; None before it is estimated
     focal_deviation: float | None = None
+    # what landmarks say of each view's pose; empty before they were looked for
     support: Mapping[int, LandmarkSupport] = field(default_factory=dict)
+    # whether depth may be the other way round than the run has it; no longer once that is clear
     may_reverse: bool = False
-    reversal: Reversal | None = None
+    reversal: Reversal | None = None  # what was done to surface and poses, where landmarks said that it was
 
     @property
     def radius(self) -> float:
@@ -260,19 +247,12 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
 
 @dataclass(frozen=True, eq=False)
 class _Begun:
-    """N landmarks that began in some of T views, and where the images say that they are in each.
+    """N landmarks that began in some of T views, and where the images say that they are in each."""
 
-    Attributes:
-        face: ``(N,)`` on which each lies.
-        barycentric: ``(N, 3)`` where on it.
-        measured: ``(T, N, 2)`` pixels, see `Chain`.
-        variance: ``(T, N)`` squared pixels.
-    """
-
-    face: NDArray[np.int64]
-    barycentric: Array
-    measured: Array
-    variance: Array
+    face: NDArray[np.int64]  # (N,) on which each lies
+    barycentric: Array  # (N, 3) where on it
+    measured: Array  # (T, N, 2) pixels, see `Chain`
+    variance: Array  # (T, N) squared pixels
 
     @property
     def followed(self) -> NDArray[np.int64]:

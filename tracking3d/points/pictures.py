@@ -21,14 +21,10 @@ _GAP = 4.0  # squared grey values: what keeps the likeness of two plain patches 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        grey: ``(H, W)``.
-        inside: ``(H, W)`` float32 pixels to the outline of the object's mask: above 0 on the object, below beside it.
-    """
-
-    grey: Grey
+    grey: Grey  # (H, W)
+    # (H, W) float32 pixels to the outline of the object's mask: above 0 on the object, below beside it
     inside: NDArray[np.float32]
 
     def depth_in_mask(self, xy: Array) -> NDArray[np.float32]:

@@ -39,24 +39,15 @@ _LENS = 0.3  # deviation of the logarithm of a focal length that is not given
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Points and poses that agree with the measurements.
+    """Points and poses that agree with the measurements."""
 
-    Attributes:
-        points: ``(N, 3)`` in object coordinates.
-        T_cam_obj: ``(T, 4, 4)``.
-        weight: ``(T, N)`` that the measurements had in the end: 0 if there is none.
-        focal_factor: By which all focal lengths are to be multiplied.
-        cost: Mean robust loss of the measurements, by weight.
-        agreeing: ``(T, N)`` bool, the measurements that the points and poses explain.
-        focal_deviation: Standard deviation of the logarithm of the focal length; None if it was not estimated.
-    """
-
-    points: Array
-    T_cam_obj: Array
-    weight: Array
-    focal_factor: float
-    cost: float
-    agreeing: NDArray[np.bool_]
+    points: Array  # (N, 3) in object coordinates
+    T_cam_obj: Array  # (T, 4, 4)
+    weight: Array  # (T, N) that the measurements had in the end: 0 if there is none
+    focal_factor: float  # by which all focal lengths are to be multiplied
+    cost: float  # mean robust loss of the measurements, by weight
+    agreeing: NDArray[np.bool_]  # (T, N) bool, the measurements that the points and poses explain
+    # standard deviation of the logarithm of the focal length; None if it was not estimated
     focal_deviation: float | None = None
 
 
@@ -163,17 +154,11 @@ def bundle(
 
 @dataclass(frozen=True, eq=False)
 class OtherWayRound:
-    """What points and poses become with depth reversed.
+    """What points and poses become with depth reversed."""
 
-    Attributes:
-        reversal: That of points and poses.
-        found: What they become by it.
-        ratio: Its cost, compared with that of the way round at hand.
-    """
-
-    reversal: Reversal
-    found: BundleResult
-    ratio: float
+    reversal: Reversal  # that of points and poses
+    found: BundleResult  # what they become by it
+    ratio: float  # its cost, compared with that of the way round at hand
 
     @property
     def is_better(self) -> bool:

@@ -17,17 +17,12 @@ STEPS = (1, 3, 7)
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What the images say about N points in T views, in pixels of each view.
+    """What the images say about N points in T views, in pixels of each view."""
 
-    Attributes:
-        measured: ``(T, N, 2)``; NaN if the image says nothing.
-        variance: ``(T, N)`` squared pixels, that of the steps before included; infinite there, 0 at the start.
-        likeness: ``(T, N)`` best likeness to a template, see `Carried`; -1 where there was none.
-    """
-
-    measured: Array
+    measured: Array  # (T, N, 2); NaN if the image says nothing
+    # (T, N) squared pixels, that of the steps before included; infinite there, 0 at the start
     variance: Array
-    likeness: Array
+    likeness: Array  # (T, N) best likeness to a template, see `Carried`; -1 where there was none
 
 
 def follow_chain(warps: Warps, start: NDArray[np.integer], xy: Array, steps: Sequence[int] = STEPS) -> Chain:

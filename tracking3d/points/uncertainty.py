@@ -23,21 +23,13 @@ _UNMEASURED = 1.0  # squared pixels
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known about N points in T views.
+    """What is known about N points in T views."""
 
-    Attributes:
-        variance: ``(T, N)`` squared pixels of the measurement; infinite if there is none.
-        spread: ``(N,)`` mean squared pixels between measurements and the landmark.
-        views: ``(N,)`` in how many views the point was measured.
-        slant: ``(N,)`` cosine between ray and surface where the point was asked for.
-        gap: ``(T,)`` views from there.
-    """
-
-    variance: Array
-    spread: Array
-    views: NDArray[np.int64]
-    slant: Array
-    gap: NDArray[np.int64]
+    variance: Array  # (T, N) squared pixels of the measurement; infinite if there is none
+    spread: Array  # (N,) mean squared pixels between measurements and the landmark
+    views: NDArray[np.int64]  # (N,) in how many views the point was measured
+    slant: Array  # (N,) cosine between ray and surface where the point was asked for
+    gap: NDArray[np.int64]  # (T,) views from there
 
     @property
     def measured(self) -> NDArray[np.bool_]:

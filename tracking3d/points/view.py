@@ -28,28 +28,18 @@ _MOST_AT_ONCE = 2**14  # pixels that OpenCV looks up in one call
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """A window of a frame and the surface in it. All pixels are the window's own; see `to_window`.
+    """A window of a frame and the surface in it. All pixels are the window's own; see `to_window`."""
 
-    Attributes:
-        image: ``(h, w)`` float32 grey values.
-        mask: ``(h, w)`` float32, 1 on the object.
-        corner: Left and upper edge of the window in the frame.
-        scale: ``(2,)`` window pixels per frame pixel.
-        intrinsics: ``(4,)`` fx, fy, cx, cy of the window.
-        T_cam_obj: ``(4, 4)``.
-        inverse_depth: ``(h, w)`` float32, one over the depth of the surface, carried on beyond the outline with
-            the depth of the nearest drawn pixel; 0 further off.
-        beyond: ``(h, w)`` float32 pixels to the nearest drawn one; 0 on the surface.
-    """
-
-    image: Plane
-    mask: Plane
-    corner: tuple[int, int]
-    scale: Array
-    intrinsics: Array
-    T_cam_obj: Array
+    image: Plane  # (h, w) float32 grey values
+    mask: Plane  # (h, w) float32, 1 on the object
+    corner: tuple[int, int]  # left and upper edge of the window in the frame
+    scale: Array  # (2,) window pixels per frame pixel
+    intrinsics: Array  # (4,) fx, fy, cx, cy of the window
+    T_cam_obj: Array  # (4, 4)
+    # (h, w) float32, one over the depth of the surface, carried on beyond the outline with the depth of the
+    # nearest drawn pixel; 0 further off
     inverse_depth: Plane
-    beyond: Plane
+    beyond: Plane  # (h, w) float32 pixels to the nearest drawn one; 0 on the surface
 
     def to_window(self, xy: Array) -> Array:
         """Pixels ``(..., 2)`` of the frame as pixels of the window."""
@@ -135,19 +125,12 @@ def sample(plane: Plane, xy: Array) -> Plane:
 
 @dataclass(frozen=True, eq=False)
 class GreyWindow:
-    """A window of a frame around the object, into which no surface is drawn yet.
+    """A window of a frame around the object, into which no surface is drawn yet."""
 
-    Attributes:
-        image: ``(h, w)`` uint8 grey values.
-        mask: ``(h, w)`` uint8, 255 on the object.
-        corner: Left and upper edge of the window in the frame.
-        scale: ``(2,)`` window pixels per frame pixel.
-    """
-
-    image: NDArray[np.uint8]
-    mask: NDArray[np.uint8]
-    corner: tuple[int, int]
-    scale: Array
+    image: NDArray[np.uint8]  # (h, w) uint8 grey values
+    mask: NDArray[np.uint8]  # (h, w) uint8, 255 on the object
+    corner: tuple[int, int]  # left and upper edge of the window in the frame
+    scale: Array  # (2,) window pixels per frame pixel
 
 
 def cut_window(

@@ -27,18 +27,12 @@ _LEAST_ROWS = 64  # below, another thread does not pay
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """N points in a further view.
+    """N points in a further view."""
 
-    Attributes:
-        predicted: ``(N, 2)`` pixels by surface and poses; NaN if there is no surface.
-        measured: ``(N, 2)`` pixels, where the image says they are; NaN if it says nothing.
-        variance: ``(N,)`` squared pixels that the step adds to x and to y; infinite if nothing was measured.
-        likeness: ``(N,)`` correlation with the template, 1 where that is too plain to tell; -1 where there was none.
-    """
-
-    predicted: Array
-    measured: Array
-    variance: Array
+    predicted: Array  # (N, 2) pixels by surface and poses; NaN if there is no surface
+    measured: Array  # (N, 2) pixels, where the image says they are; NaN if it says nothing
+    variance: Array  # (N,) squared pixels that the step adds to x and to y; infinite if nothing was measured
+    # (N,) correlation with the template, 1 where that is too plain to tell; -1 where there was none
     likeness: Array
 
 

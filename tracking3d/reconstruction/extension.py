@@ -35,15 +35,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ExtendedRun:
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        shaped: The model.
-        registration: How the earlier run's object lies in the coordinates of this one.
-    """
-
-    shaped: ShapedRun
-    registration: Registration
+    shaped: ShapedRun  # the model
+    registration: Registration  # how the earlier run's object lies in the coordinates of this one
 
     @property
     def sentence(self) -> str:

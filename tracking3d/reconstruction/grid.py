@@ -12,17 +12,11 @@ FloatArray = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Voxel centres at ``origin + spacing * (i, j, k)``, in object coordinates.
+    """Voxel centres at ``origin + spacing * (i, j, k)``, in object coordinates."""
 
-    Attributes:
-        origin: ``(3,)`` the first centre.
-        spacing: Between centres.
-        shape: Number of centres along x, y and z.
-    """
-
-    origin: NDArray[np.float64]
-    spacing: float
-    shape: tuple[int, int, int]
+    origin: NDArray[np.float64]  # (3,) the first centre
+    spacing: float  # between centres
+    shape: tuple[int, int, int]  # number of centres along x, y and z
 
     @classmethod
     def around(cls, points: NDArray[np.float64], cells: int, margin: float) -> Grid:

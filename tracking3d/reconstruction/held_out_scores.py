@@ -22,19 +22,12 @@ _MOST_DECIBELS = 60.0
 
 @dataclass(frozen=True)
 class HeldOutScores:
-    """Mean scores of frames that were left out; within the mask, as far as colours there are surely the object's.
+    """Mean scores of frames that were left out; within the mask, as far as colours there are surely the object's."""
 
-    Attributes:
-        frames: How many.
-        psnr: Peak signal-to-noise ratio, decibels.
-        ssim: Structural similarity (Wang et al., 2004).
-        covered: Share of the mask that the model covers.
-    """
-
-    frames: int
-    psnr: float
-    ssim: float
-    covered: float
+    frames: int  # how many
+    psnr: float  # peak signal-to-noise ratio, decibels
+    ssim: float  # structural similarity (Wang et al., 2004)
+    covered: float  # share of the mask that the model covers
 
 
 def held_out_scores(

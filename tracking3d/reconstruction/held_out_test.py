@@ -30,15 +30,11 @@ def is_held_out(place: int) -> bool:
 
 @dataclass(frozen=True)
 class HeldOutScore:
-    """How well a shape explains frames, in the mean.
+    """How well a shape explains frames, in the mean."""
 
-    Attributes:
-        iou: IoU of silhouette and mask.
-        colour: Mean difference of colours in [0, 1] where both the mask and the surface are; what the surface does not
-            cover counts in the IoU.
-    """
-
-    iou: float
+    iou: float  # IoU of silhouette and mask
+    # mean difference of colours in [0, 1] where both the mask and the surface are; what the surface does not
+    # cover counts in the IoU
     colour: float
 
     def better_than(self, other: HeldOutScore) -> bool:

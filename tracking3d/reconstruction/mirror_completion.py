@@ -54,18 +54,13 @@ def complete_by_symmetry(
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What the views have seen.
+    """What the views have seen."""
 
-    Attributes:
-        views: The frames.
-        depths: ``(S, S)`` depth of the surface in each: infinite on the background, and minus infinite in a narrow band
-            around the silhouette, where pixels may belong to either.
-        near: Uncertainty of these depths.
-    """
-
-    views: Sequence[ShapeView]
+    views: Sequence[ShapeView]  # the frames
+    # (S, S) depth of the surface in each: infinite on the background, and minus infinite in a narrow band
+    # around the silhouette, where pixels may belong to either
     depths: Sequence[NDArray[np.float32]]
-    near: float
+    near: float  # uncertainty of these depths
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh, views: Sequence[ShapeView]) -> _Known:

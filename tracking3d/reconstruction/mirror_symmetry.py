@@ -38,17 +38,11 @@ _NEARLY_SAME_PLANE = 0.985  # the same before planes are refined
 
 @dataclass(frozen=True, eq=False)
 class SymmetryPlane:
-    """A plane in which an object is its own mirror image.
+    """A plane in which an object is its own mirror image."""
 
-    Attributes:
-        normal: ``(3,)`` unit vector.
-        offset: Of its points along the normal.
-        support: Share of the seen surface that it maps onto the seen surface.
-    """
-
-    normal: FloatArray
-    offset: float
-    support: float
+    normal: FloatArray  # (3,) unit vector
+    offset: float  # of its points along the normal
+    support: float  # share of the seen surface that it maps onto the seen surface
 
     def reflect(self, points: FloatArray) -> FloatArray:
         """The mirror images of points ``(N, 3)``."""

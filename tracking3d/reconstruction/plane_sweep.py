@@ -41,19 +41,12 @@ _STEEPEST = 0.2  # cosine of the viewing angle below which a surface is too slan
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What one view says of depth.
+    """What one view says of depth."""
 
-    Attributes:
-        view: The view.
-        depth: ``(S, S)`` float32 z in camera coordinates, NaN where nothing is known.
-        score: ``(S, S)`` float32 correlation there.
-        stride: Spacing, in pixels, of the grid at which depths are estimated; at most.
-    """
-
-    view: ShapeView
-    depth: FloatArray
-    score: FloatArray
-    stride: int = 1
+    view: ShapeView  # the view
+    depth: FloatArray  # (S, S) float32 z in camera coordinates, NaN where nothing is known
+    score: FloatArray  # (S, S) float32 correlation there
+    stride: int = 1  # spacing, in pixels, of the grid at which depths are estimated; at most
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,19 +38,12 @@ _NEEDED = ("skimage", "fast_simplification")
 
 @dataclass(frozen=True, eq=False)
 class ShapedRun:
-    """What came of a reconstruction.
+    """What came of a reconstruction."""
 
-    Attributes:
-        model: The run's mesh as it is now.
-        views: Frames that its texture was taken from.
-        new: Whether it has a new shape.
-        sentence: How much better that is, or why the old one stays.
-    """
-
-    model: ObjectModel
-    views: int
-    new: bool
-    sentence: str
+    model: ObjectModel  # the run's mesh as it is now
+    views: int  # frames that its texture was taken from
+    new: bool  # whether it has a new shape
+    sentence: str  # how much better that is, or why the old one stays
 
 
 def retexture_run(

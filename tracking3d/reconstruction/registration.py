@@ -36,19 +36,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How another run's object lies in the coordinates of a run.
+    """How another run's object lies in the coordinates of a run."""
 
-    Attributes:
-        similarity: From the other run's object coordinates to those of the run.
-        matches: Matches that agree with it.
-        pairs: Pairs of frames that these come from.
-        error: Median reprojection error of these, in pixels of an object 200 pixels large.
-    """
-
-    similarity: Similarity
-    matches: int
-    pairs: int
-    error: float
+    similarity: Similarity  # from the other run's object coordinates to those of the run
+    matches: int  # matches that agree with it
+    pairs: int  # pairs of frames that these come from
+    error: float  # median reprojection error of these, in pixels of an object 200 pixels large
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,19 +27,12 @@ _NEXT_RUN = 10_000_000  # added to frame indices of another run, so that views o
 
 @dataclass(frozen=True, eq=False)
 class RunViews:
-    """The reliable frames of a run, or of several.
+    """The reliable frames of a run, or of several."""
 
-    Attributes:
-        shapes: Those that a shape is made from.
-        left_out: Those that it is judged by.
-        textures: Those that a texture is taken from.
-        keypoints: Those that the run is registered by, if that was asked.
-    """
-
-    shapes: Sequence[ShapeView]
-    left_out: Sequence[ShapeView]
-    textures: tuple[TextureView, ...]
-    keypoints: Sequence[SurfaceKeypoints] = ()
+    shapes: Sequence[ShapeView]  # those that a shape is made from
+    left_out: Sequence[ShapeView]  # those that it is judged by
+    textures: tuple[TextureView, ...]  # those that a texture is taken from
+    keypoints: Sequence[SurfaceKeypoints] = ()  # those that the run is registered by, if that was asked
 
     def moved(self, similarity: Similarity, number: int) -> RunViews:
         """The same frames with poses of another run's object.

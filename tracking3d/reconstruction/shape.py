@@ -60,21 +60,16 @@ _GUIDE_FACES, _FACES, _MOST_FACES = 4000, 8000, 16_000
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedShape:
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        vertices: ``(V, 3)``; faces: ``(F, 3)``: closed and oriented; None if the old shape stays.
-        sentence: What was found, or why the old shape stays.
-        old: How the old shape explains the frames that were left out; None if it was not asked.
-        new: How the new one does.
-        planes: The planes of symmetry by which unseen parts of the new shape were completed.
-    """
-
+    # (V, 3); faces: (F, 3): closed and oriented; None if the old shape stays
     vertices: NDArray[np.float64] | None
     faces: NDArray[np.int64] | None
-    sentence: str
+    sentence: str  # what was found, or why the old shape stays
+    # how the old shape explains the frames that were left out; None if it was not asked
     old: HeldOutScore | None = None
-    new: HeldOutScore | None = None
+    new: HeldOutScore | None = None  # how the new one does
+    # the planes of symmetry by which unseen parts of the new shape were completed
     planes: Sequence[SymmetryPlane] = ()
 
 

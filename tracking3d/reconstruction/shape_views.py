@@ -20,24 +20,15 @@ _MARGIN = 0.08  # around the mask, relative to its longer side
 
 @dataclass(frozen=True, eq=False)
 class ShapeView:
-    """A frame with a reliable pose and mask, cut out around the object.
+    """A frame with a reliable pose and mask, cut out around the object."""
 
-    Attributes:
-        index: Index of the frame.
-        image: ``(S, S, 3)`` uint8 RGB.
-        depth_inside: ``(S, S)`` float32, pixels from the mask's outline, positive inside.
-        within: ``(4,)`` left, right, top and bottom edge of the frame in the window's pixels; beyond them nothing
-            is known.
-        K: ``(3, 3)`` intrinsics of the window.
-        T_cam_obj: ``(4, 4)``.
-    """
-
-    index: int
-    image: NDArray[np.uint8]
-    depth_inside: NDArray[np.float32]
+    index: int  # index of the frame
+    image: NDArray[np.uint8]  # (S, S, 3) uint8 RGB
+    depth_inside: NDArray[np.float32]  # (S, S) float32, pixels from the mask's outline, positive inside
+    # (4,) left, right, top and bottom edge of the frame in the window's pixels; beyond them nothing is known
     within: NDArray[np.float32]
-    K: NDArray[np.float64]
-    T_cam_obj: NDArray[np.float64]
+    K: NDArray[np.float64]  # (3, 3) intrinsics of the window
+    T_cam_obj: NDArray[np.float64]  # (4, 4)
 
     @property
     def mask(self) -> NDArray[np.bool_]:

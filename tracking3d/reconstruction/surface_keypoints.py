@@ -25,21 +25,13 @@ _MARGIN = 3  # pixels that keypoints stay away from the outline, where the surfa
 
 @dataclass(frozen=True, eq=False)
 class SurfaceKeypoints:
-    """Keypoints of one frame.
+    """Keypoints of one frame."""
 
-    Attributes:
-        keypoints: The N keypoints; pixels are the frame's.
-        points: ``(N, 3)`` in object coordinates.
-        P: ``(3, 4)`` from object coordinates to pixels of the frame, times the depth.
-        T_cam_obj: ``(4, 4)``.
-        length: Longer side of the object in the frame, pixels.
-    """
-
-    keypoints: Keypoints
-    points: NDArray[np.float64]
-    P: NDArray[np.float64]
-    T_cam_obj: NDArray[np.float64]
-    length: float
+    keypoints: Keypoints  # the N keypoints; pixels are the frame's
+    points: NDArray[np.float64]  # (N, 3) in object coordinates
+    P: NDArray[np.float64]  # (3, 4) from object coordinates to pixels of the frame, times the depth
+    T_cam_obj: NDArray[np.float64]  # (4, 4)
+    length: float  # longer side of the object in the frame, pixels
 
 
 def shows_other_side(kept: Sequence[SurfaceKeypoints], T_cam_obj: NDArray[np.float64]) -> bool:

@@ -20,25 +20,15 @@ _OUTLINE = (1.5, 4.5)
 
 @dataclass(frozen=True, eq=False)
 class TextureView:
-    """A frame with a reliable pose, cut out around the object.
+    """A frame with a reliable pose, cut out around the object."""
 
-    Attributes:
-        index: Index of the frame.
-        image: ``(S, S, 3)`` uint8 RGB.
-        valid: ``(S, S)`` float32 in [0, 1], how far each pixel is surely the object's.
-        K: ``(3, 3)`` intrinsics of the window.
-        T_cam_obj: ``(4, 4)``.
-        extent: Longer side of the object in the frame, pixels.
-        sharpness: Share of the contrast that is in the finest details; larger is sharper.
-    """
-
-    index: int
-    image: NDArray[np.uint8]
-    valid: NDArray[np.float32]
-    K: NDArray[np.float64]
-    T_cam_obj: NDArray[np.float64]
-    extent: float
-    sharpness: float
+    index: int  # index of the frame
+    image: NDArray[np.uint8]  # (S, S, 3) uint8 RGB
+    valid: NDArray[np.float32]  # (S, S) float32 in [0, 1], how far each pixel is surely the object's
+    K: NDArray[np.float64]  # (3, 3) intrinsics of the window
+    T_cam_obj: NDArray[np.float64]  # (4, 4)
+    extent: float  # longer side of the object in the frame, pixels
+    sharpness: float  # share of the contrast that is in the finest details; larger is sharper
 
     @property
     def direction(self) -> NDArray[np.float64]:

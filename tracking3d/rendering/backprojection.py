@@ -27,19 +27,12 @@ _TEXELS_AT_ONCE = 1 << 16  # a large atlas has millions, and what is computed wi
 
 @dataclass(frozen=True, eq=False)
 class TexelMap:
-    """Where each texel of an atlas lies on the surface; fixed as long as faces and texture coordinates are.
+    """Where each texel of an atlas lies on the surface; fixed as long as faces and texture coordinates are."""
 
-    Attributes:
-        size: Side T of the texture.
-        texel: ``(N,)`` flat indices of the texels that lie on a face.
-        face: ``(N,)`` that face.
-        barycentric: ``(N, 3)`` place on that face.
-    """
-
-    size: int
-    texel: Tensor
-    face: Tensor
-    barycentric: Tensor
+    size: int  # side T of the texture
+    texel: Tensor  # (N,) flat indices of the texels that lie on a face
+    face: Tensor  # (N,) that face
+    barycentric: Tensor  # (N, 3) place on that face
 
     @classmethod
     def of(cls, face_uvs: Tensor, size: int) -> TexelMap:
@@ -68,15 +61,10 @@ class TexelMap:
 
 @dataclass(frozen=True, eq=False)
 class BackProjection:
-    """Weighted sums of what was seen of each texel; sums over frames add up.
+    """Weighted sums of what was seen of each texel; sums over frames add up."""
 
-    Attributes:
-        total: ``(C, T, T)`` weighted sum of values.
-        weight: ``(T, T)`` sum of weights.
-    """
-
-    total: Tensor
-    weight: Tensor
+    total: Tensor  # (C, T, T) weighted sum of values
+    weight: Tensor  # (T, T) sum of weights
 
     def __add__(self, other: BackProjection) -> BackProjection:
         """What both have seen."""
@@ -89,17 +77,11 @@ class BackProjection:
 
 @dataclass(frozen=True, eq=False)
 class SeenTexels:
-    """What a frame shows of some texels.
+    """What a frame shows of some texels."""
 
-    Attributes:
-        texel: ``(N,)`` flat indices, each once.
-        values: ``(C, N)`` the frame's values there.
-        weight: ``(N,)`` squared cosine of the viewing angle, times the weight of the frame there; above 0.
-    """
-
-    texel: Tensor
-    values: Tensor
-    weight: Tensor
+    texel: Tensor  # (N,) flat indices, each once
+    values: Tensor  # (C, N) the frame's values there
+    weight: Tensor  # (N,) squared cosine of the viewing angle, times the weight of the frame there; above 0
 
 
 def back_project(

@@ -31,27 +31,16 @@ PROBE = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Points on the contours of B frames.
+    """Points on the contours of B frames."""
 
-    Attributes:
-        view: ``(N,)`` int64, the frame of each point.
-        position: ``(N, 2)`` pixels; differentiable in the rendering's vertices, poses and cameras.
-        normal: ``(N, 2)`` unit normals on the screen, outward.
-        length: ``(N,)`` pixels of contour that each point stands for, without gradient.
-        points: ``(N, 3)`` the surface points in camera coordinates, without gradient.
-        vertices: ``(N, 2)`` int64, the ends of the edge that each point lies on.
-        share: ``(N, 2)`` how much of each end the surface point is in space, without gradient; sums to 1.
-        frames: B.
-    """
-
-    view: Tensor
-    position: Tensor
-    normal: Tensor
-    length: Tensor
-    points: Tensor
-    vertices: Tensor
-    share: Tensor
-    frames: int
+    view: Tensor  # (N,) int64, the frame of each point
+    position: Tensor  # (N, 2) pixels; differentiable in the rendering's vertices, poses and cameras
+    normal: Tensor  # (N, 2) unit normals on the screen, outward
+    length: Tensor  # (N,) pixels of contour that each point stands for, without gradient
+    points: Tensor  # (N, 3) the surface points in camera coordinates, without gradient
+    vertices: Tensor  # (N, 2) int64, the ends of the edge that each point lies on
+    share: Tensor  # (N, 2) how much of each end the surface point is in space, without gradient; sums to 1
+    frames: int  # B
 
 
 def find_contour(drawn: Rendering) -> Contour:

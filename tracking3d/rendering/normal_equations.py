@@ -28,16 +28,11 @@ class NormalEquations:
 
     The matrix is Gauss-Newton's, with the robust loss as weights (iteratively reweighted least squares). Models of
     the same poses add up.
-
-    Attributes:
-        matrix: ``(B, 6, 6)``.
-        gradient: ``(B, 6)``.
-        cost: ``(B,)``.
     """
 
-    matrix: Tensor
-    gradient: Tensor
-    cost: Tensor
+    matrix: Tensor  # (B, 6, 6)
+    gradient: Tensor  # (B, 6)
+    cost: Tensor  # (B,)
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         """The model of both costs together."""

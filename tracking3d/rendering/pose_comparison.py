@@ -16,36 +16,22 @@ NEAREST_POINT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PoseTarget:
-    """What a frame shows in a window of ``S`` x ``S`` pixels.
+    """What a frame shows in a window of ``S`` x ``S`` pixels."""
 
-    Attributes:
-        K: ``(3, 3)`` intrinsics of the window.
-        features: ``(C, S, S)``.
-        comparable: ``(S, S)`` how much each pixel's features count, in [0, 1].
-        inside: ``(S, S)`` bool, inside the frame.
-        mask: ``(S, S)`` bool; None if there is none.
-        distance: ``(S, S)`` signed distance in pixels to the mask's outline; None without a mask.
-    """
-
-    K: Tensor
-    features: Tensor
-    comparable: Tensor
-    inside: Tensor
-    mask: Tensor | None
-    distance: Tensor | None
+    K: Tensor  # (3, 3) intrinsics of the window
+    features: Tensor  # (C, S, S)
+    comparable: Tensor  # (S, S) how much each pixel's features count, in [0, 1]
+    inside: Tensor  # (S, S) bool, inside the frame
+    mask: Tensor | None  # (S, S) bool; None if there is none
+    distance: Tensor | None  # (S, S) signed distance in pixels to the mask's outline; None without a mask
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedPoints:
-    """Surface points and where a frame shows them.
+    """Surface points and where a frame shows them."""
 
-    Attributes:
-        points: ``(N, 3)`` in object coordinates.
-        pixels: ``(N, 2)`` in the frame's window.
-    """
-
-    points: Tensor
-    pixels: Tensor
+    points: Tensor  # (N, 3) in object coordinates
+    pixels: Tensor  # (N, 2) in the frame's window
 
     def __len__(self) -> int:
         return len(self.points)
@@ -62,23 +48,15 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class PoseTerms:
-    """The terms of B poses, float64 on the CPU; a term of which a frame says nothing is zero.
+    """The terms of B poses, float64 on the CPU; a term of which a frame says nothing is zero."""
 
-    Attributes:
-        appearance: Term of the covered pixels, weighted by `PoseTarget.comparable` and how far their texture is seen.
-        outline: Term of the silhouette's contour.
-        points: Term of the matched points.
-        comparable: ``(B,)`` sum of `PoseTarget.comparable` over the covered pixels.
-        known: ``(B,)`` the same of those whose texture is seen.
-        overlap: ``(B,)`` IoU of what is covered with the mask, inside the frame; 1 without a mask.
-    """
-
+    # term of the covered pixels, weighted by `PoseTarget.comparable` and how far their texture is seen
     appearance: NormalEquations
-    outline: NormalEquations
-    points: NormalEquations
-    comparable: Tensor
-    known: Tensor
-    overlap: Tensor
+    outline: NormalEquations  # term of the silhouette's contour
+    points: NormalEquations  # term of the matched points
+    comparable: Tensor  # (B,) sum of `PoseTarget.comparable` over the covered pixels
+    known: Tensor  # (B,) the same of those whose texture is seen
+    overlap: Tensor  # (B,) IoU of what is covered with the mask, inside the frame; 1 without a mask
 
 
 def check_comparison(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> None:

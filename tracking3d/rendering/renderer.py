@@ -32,32 +32,19 @@ class SoftBand:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What the renderer returns. P pixels are covered, in the order of ``(face_index >= 0).nonzero()``.
+    """What the renderer returns. P pixels are covered, in the order of ``(face_index >= 0).nonzero()``."""
 
-    Attributes:
-        face_index: ``(B, H, W)`` int64, -1 where uncovered.
-        depth: ``(B, H, W)`` z in camera coordinates, infinite where uncovered; no gradient, see `points`.
-        pixels: ``(P,)`` int64, flat indices of the covered pixels in ``(B, H, W)``.
-        texture: ``(C, T, T)`` as given.
-        x_cam: ``(B, V, 3)`` vertices in camera coordinates.
-        screen: ``(B, V, 2)`` vertices in pixels.
-        faces: ``(F, 3)``; face_uvs: ``(F, 3, 2)``; as given.
-        K: ``(B, 3, 3)`` as given.
-        band: The kernel of the soft silhouette.
-        backend: Which implementation was asked for.
-    """
-
-    face_index: Tensor
-    depth: Tensor
-    pixels: Tensor
-    texture: Tensor
-    x_cam: Tensor
-    screen: Tensor
-    faces: Tensor
+    face_index: Tensor  # (B, H, W) int64, -1 where uncovered
+    depth: Tensor  # (B, H, W) z in camera coordinates, infinite where uncovered; no gradient, see `points`
+    pixels: Tensor  # (P,) int64, flat indices of the covered pixels in (B, H, W)
+    texture: Tensor  # (C, T, T) as given
+    x_cam: Tensor  # (B, V, 3) vertices in camera coordinates
+    screen: Tensor  # (B, V, 2) vertices in pixels
+    faces: Tensor  # (F, 3); face_uvs: (F, 3, 2); as given
     face_uvs: Tensor
-    K: Tensor
-    band: SoftBand = SoftBand()
-    backend: str = "auto"
+    K: Tensor  # (B, 3, 3) as given
+    band: SoftBand = SoftBand()  # the kernel of the soft silhouette
+    backend: str = "auto"  # which implementation was asked for
 
     @cached_property
     def silhouette(self) -> Tensor:

@@ -11,22 +11,14 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The object as poses are fitted to it.
+    """The object as poses are fitted to it."""
 
-    Attributes:
-        vertices: ``(V, 3)`` in object coordinates.
-        faces: ``(F, 3)`` int64; face_uvs: ``(F, 3, 2)``.
-        texture: ``(C, T, T)`` features.
-        seen: ``(1, T, T)`` 1 where the texture is known, else 0.
-        renderer: Which renderer, see `tracking3d.rendering.backend`.
-    """
-
-    vertices: Tensor
-    faces: Tensor
+    vertices: Tensor  # (V, 3) in object coordinates
+    faces: Tensor  # (F, 3) int64; face_uvs: (F, 3, 2)
     face_uvs: Tensor
-    texture: Tensor
-    seen: Tensor
-    renderer: str = "auto"
+    texture: Tensor  # (C, T, T) features
+    seen: Tensor  # (1, T, T) 1 where the texture is known, else 0
+    renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
 
     @cached_property
     def layers(self) -> Tensor:

@@ -21,17 +21,11 @@ NEAR = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The nearest front-facing face at every pixel.
+    """The nearest front-facing face at every pixel."""
 
-    Attributes:
-        face_index: ``(B, H, W)`` int64, -1 where no face is.
-        depth: ``(B, H, W)`` z in camera coordinates, infinite where no face is.
-        pixels: ``(P,)`` int64, flat indices of the covered pixels in ``(B, H, W)``, rising.
-    """
-
-    face_index: Tensor
-    depth: Tensor
-    pixels: Tensor
+    face_index: Tensor  # (B, H, W) int64, -1 where no face is
+    depth: Tensor  # (B, H, W) z in camera coordinates, infinite where no face is
+    pixels: Tensor  # (P,) int64, flat indices of the covered pixels in (B, H, W), rising
 
 
 def expand_ranges(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:

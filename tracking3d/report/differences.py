@@ -30,23 +30,15 @@ MOST_FRAMES = 6
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """One run against the first one, over the ``N`` frames with estimates in both.
+    """One run against the first one, over the ``N`` frames with estimates in both."""
 
-    Attributes:
-        name: The run.
-        indices: ``(N,)`` of the frames in the source.
-        iou: ``(N,)`` of both masks; NaN where one is missing or both are empty.
-        rotation: ``(N,)`` degrees between both poses; NaN where one is lost.
-        translation: ``(N,)`` between both, in percent of the object's distance in the first run; NaN likewise.
-        scale: Length of the run's unit in that of the first one's; NaN where no frame has both poses.
-    """
-
-    name: str
-    indices: NDArray[np.int64]
-    iou: NDArray[np.float64]
-    rotation: NDArray[np.float64]
+    name: str  # the run
+    indices: NDArray[np.int64]  # (N,) of the frames in the source
+    iou: NDArray[np.float64]  # (N,) of both masks; NaN where one is missing or both are empty
+    rotation: NDArray[np.float64]  # (N,) degrees between both poses; NaN where one is lost
+    # (N,) between both, in percent of the object's distance in the first run; NaN likewise
     translation: NDArray[np.float64]
-    scale: float
+    scale: float  # length of the run's unit in that of the first one's; NaN where no frame has both poses
 
     @property
     def summary(self) -> dict[str, float | None]:
@@ -65,27 +57,17 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class RunComparison:
-    """Runs over one video.
+    """Runs over one video."""
 
-    Attributes:
-        runs: The runs; the first one is what the others are held against.
-        names: What to call them; no two alike.
-        settings: By name, the value in each run as text, of those that differ; None if a run has none such.
-        differences: Differences of each run but the first.
-        worst: Indices of the frames that differ most, in order of time.
-        notes: What to know, in sentences.
-        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN if there is none.
-        rotation_between: ``(R, R)`` degrees between their poses, in the median; NaN likewise.
-    """
-
-    runs: list[RunReader]
-    names: list[str]
+    runs: list[RunReader]  # the runs; the first one is what the others are held against
+    names: list[str]  # what to call them; no two alike
+    # by name, the value in each run as text, of those that differ; None if a run has none such
     settings: dict[str, list[str | None]]
-    differences: list[Difference]
-    worst: list[int]
-    notes: list[str]
-    iou_between: NDArray[np.float64]
-    rotation_between: NDArray[np.float64]
+    differences: list[Difference]  # differences of each run but the first
+    worst: list[int]  # indices of the frames that differ most, in order of time
+    notes: list[str]  # what to know, in sentences
+    iou_between: NDArray[np.float64]  # (R, R) mean IoU of the masks of every two runs; NaN if there is none
+    rotation_between: NDArray[np.float64]  # (R, R) degrees between their poses, in the median; NaN likewise
 
     def as_json(self) -> dict[str, Any]:
         """All of it in JSON's types, frame by frame too."""

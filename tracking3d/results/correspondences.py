@@ -41,35 +41,25 @@ class PointKind(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class PointTracks:
-    """N surface points in T frames.
+    """N surface points in T frames."""
 
-    Attributes:
-        query_frame: Index of the frame that the points were queried in.
-        query: ``(N, 2)`` the pixels asked for, x and y.
-        frames: ``(T,)`` int64 frame indices.
-        positions: ``(T, N, 2)`` pixels; NaN for a point that is not followed or is behind the camera.
-        visible: ``(T, N)`` bool; for points on the surface false if the frame is lost or its mask empty.
-        on_object: ``(N,)`` bool: whether the pixel lies on the object: on its mesh, or on its mask where points
-            that the mesh does not cover are followed.
-        face: ``(N,)`` int64 face of the mesh, -1 off the object.
-        barycentric: ``(N, 3)`` weights of the face's corners, NaN off the object.
-        points: ``(N, 3)`` in object coordinates, NaN off the object.
-        uncertainty: ``(T, N)`` pixels; twice this bounds about 19 of 20 errors. NaN if unknown.
-        measured: ``(T, N)`` bool: whether the image had a say.
-        kind: ``(N,)`` text, by what each is followed; see `PointKind`.
-    """
-
-    query_frame: int
-    query: NDArray[np.float64]
-    frames: NDArray[np.int64]
+    query_frame: int  # index of the frame that the points were queried in
+    query: NDArray[np.float64]  # (N, 2) the pixels asked for, x and y
+    frames: NDArray[np.int64]  # (T,) int64 frame indices
+    # (T, N, 2) pixels; NaN for a point that is not followed or is behind the camera
     positions: NDArray[np.float64]
+    # (T, N) bool; for points on the surface false if the frame is lost or its mask empty
     visible: NDArray[np.bool_]
+    # (N,) bool: whether the pixel lies on the object: on its mesh, or on its mask where points that the mesh
+    # does not cover are followed
     on_object: NDArray[np.bool_]
-    face: NDArray[np.int64]
-    barycentric: NDArray[np.float64]
-    points: NDArray[np.float64]
+    face: NDArray[np.int64]  # (N,) int64 face of the mesh, -1 off the object
+    barycentric: NDArray[np.float64]  # (N, 3) weights of the face's corners, NaN off the object
+    points: NDArray[np.float64]  # (N, 3) in object coordinates, NaN off the object
+    # (T, N) pixels; twice this bounds about 19 of 20 errors. NaN if unknown.
     uncertainty: NDArray[np.float64]
-    measured: NDArray[np.bool_]
+    measured: NDArray[np.bool_]  # (T, N) bool: whether the image had a say
+    # (N,) text, by what each is followed; see `PointKind`
     kind: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "<U7"))
 
 

@@ -28,33 +28,20 @@ MOST_FAILURES = 20
 
 @dataclass(frozen=True, eq=False)
 class RunHeader:
-    """The facts of a run before its first frame.
+    """The facts of a run before its first frame."""
 
-    Attributes:
-        config: The configuration as used.
-        camera: The camera of the full frame.
-        source: The tracked video, in words.
-        seed: Seed of everything random.
-        fps: Frames per second of the source, if known.
-        command: The command line, if there was one.
-        source_notes: How the source processed its images, in clauses.
-        selection: The ``START:STOP:STEP`` that the source was opened with.
-        renderer: What renders, and why.
-        given: The identity of source and prompt, see `tracking3d.checkpoint.resuming.prompt_record`.
-        tracker_choice: Why ``auto`` chose the mask tracker of ``config``; None if the user named it.
-    """
-
-    config: dict[str, Any]
-    camera: Camera
-    source: str
-    seed: int
-    fps: float | None
-    command: str | None
-    source_notes: Sequence[str] = ()
-    selection: str | None = None
-    renderer: Mapping[str, str | int] | None = None
+    config: dict[str, Any]  # the configuration as used
+    camera: Camera  # the camera of the full frame
+    source: str  # the tracked video, in words
+    seed: int  # seed of everything random
+    fps: float | None  # frames per second of the source, if known
+    command: str | None  # the command line, if there was one
+    source_notes: Sequence[str] = ()  # how the source processed its images, in clauses
+    selection: str | None = None  # the START:STOP:STEP that the source was opened with
+    renderer: Mapping[str, str | int] | None = None  # what renders, and why
+    # the identity of source and prompt, see `tracking3d.checkpoint.resuming.prompt_record`
     given: Mapping[str, Any] | None = None
-    tracker_choice: str | None = None
+    tracker_choice: str | None = None  # why auto chose the mask tracker of config; None if the user named it
 
 
 def for_new_folder(command: str) -> str:

@@ -45,52 +45,32 @@ _MOST = 2**53  # the largest count that every reader of JSON knows exactly
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """The record of one frame in the run folder, without its masks.
+    """The record of one frame in the run folder, without its masks."""
 
-    Attributes:
-        index: The frame's index in the source.
-        time: Seconds since the start of the video, if known.
-        name: What messages call the frame.
-        T_cam_obj: ``(4, 4)`` float64 from object to camera; NaN if the estimate was not a number.
-        status: The estimator's judgement.
-        reason: Why, in words.
-        confidence: In [0, 1].
-        losses: Each loss term at the estimate, unweighted, by name; NaN if it was not a number.
-        iterations: Optimizer iterations spent.
-        keyframe: Whether the frame became a keyframe.
-        seconds: Wall time spent on the frame, all stages together; of a revision 0, see `latest`.
-        iou_initial: IoU of the estimate and the initial mask; None without an initial mask.
-        area: Pixels of the estimated mask.
-        revision: Whether this replaces an earlier estimate.
-        failure: Which plug-in failed at this frame, and why; empty if none did.
-        hypothesis: The pose hypothesis that won, in a word or two; empty if there was only one.
-        refined: Whether this is the estimate of the final refinement, not the causal one.
-        stages: The same time stage by stage; None in revisions.
-        mask_source: Where the estimated mask comes from; None if unknown.
-        camera: fx, fy, cx, cy of the camera that the pose is of; None if it is the run's.
-        diagnostics: The other numbers behind status and confidence, by name; NaN if it was not a number.
-    """
-
-    index: int
-    time: float | None
-    name: str
+    index: int  # the frame's index in the source
+    time: float | None  # seconds since the start of the video, if known
+    name: str  # what messages call the frame
+    # (4, 4) float64 from object to camera; NaN if the estimate was not a number
     T_cam_obj: NDArray[np.float64]
-    status: Status
-    reason: str
-    confidence: float
+    status: Status  # the estimator's judgement
+    reason: str  # why, in words
+    confidence: float  # in [0, 1]
+    # each loss term at the estimate, unweighted, by name; NaN if it was not a number
     losses: dict[str, float]
-    iterations: int
-    keyframe: bool
-    seconds: float
-    iou_initial: float | None
-    area: int
-    revision: bool = False
-    failure: str = ""
-    hypothesis: str = ""
-    refined: bool = False
-    stages: StageTimes | None = None
-    mask_source: MaskSource | None = None
+    iterations: int  # optimizer iterations spent
+    keyframe: bool  # whether the frame became a keyframe
+    seconds: float  # wall time spent on the frame, all stages together; of a revision 0, see `latest`
+    iou_initial: float | None  # IoU of the estimate and the initial mask; None without an initial mask
+    area: int  # pixels of the estimated mask
+    revision: bool = False  # whether this replaces an earlier estimate
+    failure: str = ""  # which plug-in failed at this frame, and why; empty if none did
+    hypothesis: str = ""  # the pose hypothesis that won, in a word or two; empty if there was only one
+    refined: bool = False  # whether this is the estimate of the final refinement, not the causal one
+    stages: StageTimes | None = None  # the same time stage by stage; None in revisions
+    mask_source: MaskSource | None = None  # where the estimated mask comes from; None if unknown
+    # fx, fy, cx, cy of the camera that the pose is of; None if it is the run's
     camera: tuple[float, float, float, float] | None = None
+    # the other numbers behind status and confidence, by name; NaN if it was not a number
     diagnostics: dict[str, float] = field(default_factory=dict)
 
     @classmethod

@@ -29,12 +29,9 @@ _SAMPLES = 44
 
 @dataclass(frozen=True, eq=False)
 class ColourModels:
-    """What earlier frames showed.
+    """What earlier frames showed."""
 
-    Attributes:
-        histograms: ``(2, B)`` of the object and of its surroundings, see `tracking3d.trackers.colour_models`.
-    """
-
+    # (2, B) of the object and of its surroundings, see `tracking3d.trackers.colour_models`
     histograms: NDArray[np.float64]
 
     @classmethod

@@ -24,56 +24,32 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Answered:
-    """A frame and what is known of it, through a pinhole camera.
+    """A frame and what is known of it, through a pinhole camera."""
 
-    Attributes:
-        index: The index of the frame.
-        image: ``(H, W, 3)`` RGB.
-        initial: ``(H, W)`` the mask tracker's mask.
-        answer: ``(H, W)`` the estimated mask.
-        T_cam_obj: ``(4, 4)``; NaN if there is no pose that is trusted.
-        confidence: The confidence of the pose, in [0, 1].
-        occluder: ``(H, W)`` what is in front of the object; None if nothing is known.
-    """
-
-    index: int
-    image: Image
-    initial: Mask
-    answer: Mask
-    T_cam_obj: NDArray[np.float64]
-    confidence: float
-    occluder: Mask | None = None
+    index: int  # the index of the frame
+    image: Image  # (H, W, 3) RGB
+    initial: Mask  # (H, W) the mask tracker's mask
+    answer: Mask  # (H, W) the estimated mask
+    T_cam_obj: NDArray[np.float64]  # (4, 4); NaN if there is no pose that is trusted
+    confidence: float  # the confidence of the pose, in [0, 1]
+    occluder: Mask | None = None  # (H, W) what is in front of the object; None if nothing is known
 
 
 @dataclass(frozen=True, eq=False)
 class FrameWindow:
-    """A frame, the object's surface at its pose, and where masks say that the object is.
+    """A frame, the object's surface at its pose, and where masks say that the object is."""
 
-    Attributes:
-        window: Of the frame; all planes are ``(S, S)`` of it.
-        image: ``(S, S, 3)`` RGB.
-        K: ``(3, 3)`` intrinsics of the window.
-        T_cam_obj: ``(4, 4)``; NaN if there is no pose.
-        initial: The mask tracker's mask.
-        answer: The estimated mask.
-        drawn: The silhouette; empty without a pose.
-        inverse_depth: Of the surface, carried on beyond the silhouette; 0 without a pose.
-        confidence: The confidence of the pose, in [0, 1].
-        valid: What lies in the frame.
-        occluder: What is in front of the object; None if nothing is known.
-    """
-
-    window: Window
-    image: NDArray[np.uint8]
-    K: NDArray[np.float64]
-    T_cam_obj: NDArray[np.float64]
-    initial: Mask
-    answer: Mask
-    drawn: Mask
-    inverse_depth: Plane
-    confidence: float
-    valid: Mask
-    occluder: Mask | None = None
+    window: Window  # of the frame; all planes are (S, S) of it
+    image: NDArray[np.uint8]  # (S, S, 3) RGB
+    K: NDArray[np.float64]  # (3, 3) intrinsics of the window
+    T_cam_obj: NDArray[np.float64]  # (4, 4); NaN if there is no pose
+    initial: Mask  # the mask tracker's mask
+    answer: Mask  # the estimated mask
+    drawn: Mask  # the silhouette; empty without a pose
+    inverse_depth: Plane  # of the surface, carried on beyond the silhouette; 0 without a pose
+    confidence: float  # the confidence of the pose, in [0, 1]
+    valid: Mask  # what lies in the frame
+    occluder: Mask | None = None  # what is in front of the object; None if nothing is known
 
     @classmethod
     def of(

@@ -45,19 +45,12 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MotionReference:
-    """A frame whose pose is trusted, as small as motion is looked for in it.
+    """A frame whose pose is trusted, as small as motion is looked for in it."""
 
-    Attributes:
-        grey: ``(h, w)`` from `tracking3d.segmentation.motion_cue.smaller`.
-        mask: ``(h, w)`` where the object is.
-        T_cam_obj: ``(4, 4)``.
-        size: ``(H, W)`` of the frame itself.
-    """
-
-    grey: NDArray[np.uint8]
-    mask: Mask
-    T_cam_obj: Matrix
-    size: tuple[int, int]
+    grey: NDArray[np.uint8]  # (h, w) from `tracking3d.segmentation.motion_cue.smaller`
+    mask: Mask  # (h, w) where the object is
+    T_cam_obj: Matrix  # (4, 4)
+    size: tuple[int, int]  # (H, W) of the frame itself
 
     @classmethod
     def of(cls, grey: NDArray[np.uint8], mask: Mask, T_cam_obj: Matrix) -> Self:
@@ -109,17 +102,11 @@ def online_motion_log_odds(
 
 @dataclass(frozen=True, eq=False)
 class _Ways:
-    """How a window's pixels get into the ``grey`` of an earlier frame.
+    """How a window's pixels get into the ``grey`` of an earlier frame."""
 
-    Attributes:
-        past: The earlier frame.
-        of_surface: ``(3, 4)`` from ``u, v, 1, 1 / depth`` by the object's motion.
-        of_background: ``(3, 3)`` from ``u, v, 1`` by the background's.
-    """
-
-    past: MotionReference
-    of_surface: Matrix
-    of_background: Matrix
+    past: MotionReference  # the earlier frame
+    of_surface: Matrix  # (3, 4) from u, v, 1, 1 / depth by the object's motion
+    of_background: Matrix  # (3, 3) from u, v, 1 by the background's
 
     @classmethod
     def of(

@@ -42,19 +42,12 @@ _MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is a
 
 @dataclass(frozen=True, eq=False)
 class SegmentedMask:
-    """What came of a frame.
+    """What came of a frame."""
 
-    Attributes:
-        index: The index of the frame.
-        mask: ``(H, W)``.
-        probability: ``(H, W)`` of the object; the mask is where it is above a half.
-        is_initial: Whether it is the initial mask as it was.
-    """
-
-    index: int
-    mask: Mask
-    probability: Plane
-    is_initial: bool = False
+    index: int  # the index of the frame
+    mask: Mask  # (H, W)
+    probability: Plane  # (H, W) of the object; the mask is where it is above a half
+    is_initial: bool = False  # whether it is the initial mask as it was
 
 
 class VideoSegmenter:

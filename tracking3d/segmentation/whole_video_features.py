@@ -35,22 +35,16 @@ _SCALE_OF_LOGS, _SCALE_OF_MOTION = 3.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class PixelEvidence:
-    """What the sources say in one frame.
+    """What the sources say in one frame."""
 
-    Attributes:
-        distances: ``(S, S)`` signed distances, positive inside, over the root of the area, by whose outline it is:
-            ``initial``, ``answer``, ``drawn`` and the hulls ``hull`` and ``wide hull``; absent if there is none.
-        alignments: How well each lies on edges, around each pixel ``(S, S)`` and on the whole.
-        colours: ``(2, S, S)`` beside the outline, and remembered.
-        motion: ``(2, S, S)``.
-        confidence: The confidence of the pose.
-    """
-
+    # (S, S) signed distances, positive inside, over the root of the area, by whose outline it is: initial,
+    # answer, drawn and the hulls hull and wide hull; absent if there is none
     distances: Mapping[str, Plane]
+    # how well each lies on edges, around each pixel (S, S) and on the whole
     alignments: Mapping[str, tuple[Plane, float]]
-    colours: Plane
-    motion: Plane
-    confidence: float
+    colours: Plane  # (2, S, S) beside the outline, and remembered
+    motion: Plane  # (2, S, S)
+    confidence: float  # the confidence of the pose
 
     @classmethod
     def of(

@@ -33,17 +33,11 @@ class DisagreementError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class SubmapAlignment:
-    """The similarity from the second of two parts to the first.
+    """The similarity from the second of two parts to the first."""
 
-    Attributes:
-        fit: Similarity of their poses, and of landmarks if both have some.
-        frames: Number of compared frames.
-        landmarks: Number of compared landmarks.
-    """
-
-    fit: SimilarityFit
-    frames: int
-    landmarks: int
+    fit: SimilarityFit  # similarity of their poses, and of landmarks if both have some
+    frames: int  # number of compared frames
+    landmarks: int  # number of compared landmarks
 
 
 def common_poses(

@@ -26,38 +26,24 @@ _CHANGE = 2.0  # what a change of the mask's area from one preview frame to the 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """The object in a frame of the preview.
+    """The object in a frame of the preview."""
 
-    Attributes:
-        position: Position of the frame among the selected ones, from 0.
-        area: Pixels of the mask, at the common resolution of all sightings; 0 if there is none.
-        touches_border: Whether the mask comes up to the image's border.
-        score: Confidence of the mask, in [0, 1].
-        mask: ``(H, W)`` bool at that resolution; None if it is not kept.
-    """
-
-    position: int
-    area: int
-    touches_border: bool
-    score: float
-    mask: NDArray[np.bool_] | None = None
+    position: int  # position of the frame among the selected ones, from 0
+    area: int  # pixels of the mask, at the common resolution of all sightings; 0 if there is none
+    touches_border: bool  # whether the mask comes up to the image's border
+    score: float  # confidence of the mask, in [0, 1]
+    mask: NDArray[np.bool_] | None = None  # (H, W) bool at that resolution; None if it is not kept
 
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of the selected frames.
+    """A stretch of the selected frames."""
 
-    Attributes:
-        number: From 0.
-        start: Position of its first frame.
-        stop: One past its last.
-        owns_from: Position of the first frame whose estimate the merged run takes from it: frames that the part before
-            tracked as well keep the estimates of that one, whose model has seen more.
-    """
-
-    number: int
-    start: int
-    stop: int
+    number: int  # from 0
+    start: int  # position of its first frame
+    stop: int  # one past its last
+    # position of the first frame whose estimate the merged run takes from it: frames that the part before
+    # tracked as well keep the estimates of that one, whose model has seen more
     owns_from: int
 
 

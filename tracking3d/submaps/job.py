@@ -20,31 +20,18 @@ Tell = Callable[[Any], None]
 
 @dataclass(frozen=True, eq=False)
 class LongVideo:
-    """What is to be tracked.
+    """What is to be tracked."""
 
-    Attributes:
-        source: A video file, or a folder or pattern of images.
-        config: The pipeline, with the solver ``online`` and its final refinement.
-        folder: The run folder.
-        prompts: What the object is in the first frame.
-        length: Length of a part, in seconds or frames, see `parse_length`.
-        workers: Processes at a time, for the record.
-        selection: ``START:STOP:STEP`` of the frames.
-        command: For the record.
-        overwrite: Replace a run that is in the folder.
-        resume: Continue the run that is there.
-    """
-
-    source: str
-    config: PipelineConfig
-    folder: Path
-    prompts: PromptSet
-    length: str
-    workers: int = 2
-    selection: str | None = None
-    command: str | None = None
-    overwrite: bool = False
-    resume: bool = False
+    source: str  # a video file, or a folder or pattern of images
+    config: PipelineConfig  # the pipeline, with the solver online and its final refinement
+    folder: Path  # the run folder
+    prompts: PromptSet  # what the object is in the first frame
+    length: str  # length of a part, in seconds or frames, see `parse_length`
+    workers: int = 2  # processes at a time, for the record
+    selection: str | None = None  # START:STOP:STEP of the frames
+    command: str | None = None  # for the record
+    overwrite: bool = False  # replace a run that is in the folder
+    resume: bool = False  # continue the run that is there
 
     @property
     def precomputed(self) -> bool:
@@ -59,17 +46,11 @@ class LongVideo:
 
 @dataclass(frozen=True)
 class SplitResult:
-    """What became of a video that was to be split.
+    """What became of a video that was to be split."""
 
-    Attributes:
-        folders: Its run folder, or those of its parts if they could not be merged.
-        parts: How many there were.
-        reason: Why they could not be merged, or why it was not cut; empty if they were.
-    """
-
-    folders: tuple[Path, ...]
-    parts: int
-    reason: str = ""
+    folders: tuple[Path, ...]  # its run folder, or those of its parts if they could not be merged
+    parts: int  # how many there were
+    reason: str = ""  # why they could not be merged, or why it was not cut; empty if they were
 
 
 def refuse_what_cannot_be_joined(config: PipelineConfig) -> None:

@@ -41,19 +41,12 @@ part before ends with. One of them may well have lost a side of the object."""
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A video whose parts have their causal estimates.
+    """A video whose parts have their causal estimates."""
 
-    Attributes:
-        begun: The video.
-        jobs: Its parts, as they were tracked last.
-        again: Numbers of the parts that were tracked again.
-        seconds: What tracking the parts took.
-    """
-
-    begun: Begun
-    jobs: tuple[PartJob, ...]
-    again: tuple[int, ...] = ()
-    seconds: float = 0.0
+    begun: Begun  # the video
+    jobs: tuple[PartJob, ...]  # its parts, as they were tracked last
+    again: tuple[int, ...] = ()  # numbers of the parts that were tracked again
+    seconds: float = 0.0  # what tracking the parts took
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +66,12 @@ class Refused:
 
 @dataclass(frozen=True, eq=False)
 class MergedSubmaps:
-    """A video whose parts are one run, but for its second estimates.
+    """A video whose parts are one run, but for its second estimates."""
 
-    Attributes:
-        begun: The video.
-        looks: Frames to be refined, by parts.
-        about: The section ``split`` of ``run.json``.
-        seconds: What each step took, by name.
-    """
-
-    begun: Begun
-    looks: tuple[Revisit, ...]
-    about: Mapping[str, Any]
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    begun: Begun  # the video
+    looks: tuple[Revisit, ...]  # frames to be refined, by parts
+    about: Mapping[str, Any]  # the section split of run.json
+    seconds: Mapping[str, float] = field(default_factory=dict)  # what each step took, by name
 
 
 def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
@@ -128,15 +114,10 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """A video whose frames are all estimated, to be drawn.
+    """A video whose frames are all estimated, to be drawn."""
 
-    Attributes:
-        merged: The run; its ``seconds`` are those of all steps.
-        precomputed: What the last steps of its final refinement come to.
-    """
-
-    merged: MergedSubmaps
-    precomputed: PrecomputedRefinement
+    merged: MergedSubmaps  # the run; its seconds are those of all steps
+    precomputed: PrecomputedRefinement  # what the last steps of its final refinement come to
 
 
 def end(tell: Tell, ending: Ending) -> None:

@@ -30,21 +30,13 @@ from tracking3d.submaps.cuts import Part
 
 @dataclass(frozen=True, eq=False)
 class PartRun:
-    """A part that is tracked.
+    """A part that is tracked."""
 
-    Attributes:
-        part: Which frames it has.
-        folder: Its run folder.
-        kept: Its saved state.
-        records: Its causal estimates, by the first part's lens.
-        similarity: From its object to that of the merged run.
-    """
-
-    part: Part
-    folder: Path
-    kept: SavedState
-    records: Sequence[FrameRecord]
-    similarity: Similarity
+    part: Part  # which frames it has
+    folder: Path  # its run folder
+    kept: SavedState  # its saved state
+    records: Sequence[FrameRecord]  # its causal estimates, by the first part's lens
+    similarity: Similarity  # from its object to that of the merged run
 
 
 def write_merged_run(

@@ -39,21 +39,13 @@ _SAME_LENS = math.log(1.05)
 
 @dataclass(frozen=True, eq=False)
 class MergedMap:
-    """The merged map of all parts.
+    """The merged map of all parts."""
 
-    Attributes:
-        runs: The parts, each with its similarity to the merged object.
-        session: The state of a session that has seen all of them.
-        camera: The camera of the causal estimates.
-        alignments: A description of each alignment, for ``run.json``.
-        cost_ratio: Cost of the keyframes after merging, divided by their cost in their own parts.
-    """
-
-    runs: Sequence[PartRun]
-    session: Mapping[str, Any]
-    camera: Camera
-    alignments: Sequence[Mapping[str, Any]]
-    cost_ratio: float
+    runs: Sequence[PartRun]  # the parts, each with its similarity to the merged object
+    session: Mapping[str, Any]  # the state of a session that has seen all of them
+    camera: Camera  # the camera of the causal estimates
+    alignments: Sequence[Mapping[str, Any]]  # a description of each alignment, for run.json
+    cost_ratio: float  # cost of the keyframes after merging, divided by their cost in their own parts
 
 
 def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> MergedMap:

@@ -35,46 +35,30 @@ from tracking3d.video.selection import parse_selection
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Refined estimates of all parts, to be merged.
+    """Refined estimates of all parts, to be merged."""
 
-    Attributes:
-        looks: The frames that were looked at, by parts, in order of time.
-        seconds: What the refinement took until then.
-    """
-
-    looks: Sequence[Revisit]
-    seconds: float
+    looks: Sequence[Revisit]  # the frames that were looked at, by parts, in order of time
+    seconds: float  # what the refinement took until then
 
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Frames of one part, to get their final poses.
+    """Frames of one part, to get their final poses."""
 
-    Attributes:
-        job: The frames.
-        look: What all frames say together.
-    """
-
-    job: Revisit
-    look: GlobalAdjustment
+    job: Revisit  # the frames
+    look: GlobalAdjustment  # what all frames say together
 
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """Frames, to get their final masks.
+    """Frames, to get their final masks."""
 
-    Attributes:
-        job: The frames; those of the whole video when masks are collected.
-        estimates: Those of the whole video with their final poses, by frame index.
-        look: What all frames say together.
-        retracked: The masks of frames that were estimated again after the adjustment, as PNG, by index.
-        masks: What the masks of all frames have in common; None when that is to be found.
-    """
-
-    job: Revisit
-    estimates: Mapping[int, FrameRecord]
-    look: GlobalAdjustment
+    job: Revisit  # the frames; those of the whole video when masks are collected
+    estimates: Mapping[int, FrameRecord]  # those of the whole video with their final poses, by frame index
+    look: GlobalAdjustment  # what all frames say together
+    # the masks of frames that were estimated again after the adjustment, as PNG, by index
     retracked: Mapping[int, bytes]
+    # what the masks of all frames have in common; None when that is to be found
     masks: VideoSegmenter | None = None
 
 

@@ -29,17 +29,11 @@ _PLAN = "plan.json"
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The parts of a video.
+    """The parts of a video."""
 
-    Attributes:
-        parts: The parts, at least one.
-        seconds: Time of the preview.
-        preview_frames: Number of frames in the preview.
-    """
-
-    parts: Sequence[Part]
-    seconds: float = 0.0
-    preview_frames: int = 0
+    parts: Sequence[Part]  # the parts, at least one
+    seconds: float = 0.0  # time of the preview
+    preview_frames: int = 0  # number of frames in the preview
 
 
 def selection_of(whole: range, start: int, stop: int) -> str:

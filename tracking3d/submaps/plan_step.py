@@ -33,23 +33,14 @@ BEFORE = "that was found when they were tracked"
 
 @dataclass(frozen=True, eq=False)
 class Begun:
-    """A video that is cut.
+    """A video that is cut."""
 
-    Attributes:
-        video: What is tracked.
-        config: The pipeline with the mask tracker that was chosen.
-        choice: Why it is that one; None if the user named it.
-        count: Frames that were asked for.
-        plan: The plan of its parts.
-        jobs: Its parts.
-    """
-
-    video: LongVideo
-    config: PipelineConfig
-    choice: str | None
-    count: int
-    plan: Plan
-    jobs: tuple[PartJob, ...]
+    video: LongVideo  # what is tracked
+    config: PipelineConfig  # the pipeline with the mask tracker that was chosen
+    choice: str | None  # why it is that one; None if the user named it
+    count: int  # frames that were asked for
+    plan: Plan  # the plan of its parts
+    jobs: tuple[PartJob, ...]  # its parts
 
 
 def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:

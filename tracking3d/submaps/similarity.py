@@ -32,21 +32,13 @@ _FLOOR = 1e-3  # of the median distance, so that no single row takes all the wei
 
 @dataclass(frozen=True, eq=False)
 class SimilarityFit:
-    """A similarity and its uncertainty.
+    """A similarity and its uncertainty."""
 
-    Attributes:
-        similarity: The similarity.
-        angles: ``(F,)`` degrees by which it leaves each frame's rotation wrong.
-        distances: ``(F,)`` the same of translations, in the first's unit.
-        scale_error: Standard error of the scale, relative.
-        translation_error: Standard error of the translation, in the first's unit.
-    """
-
-    similarity: Similarity
-    angles: Array
-    distances: Array
-    scale_error: float
-    translation_error: float
+    similarity: Similarity  # the similarity
+    angles: Array  # (F,) degrees by which it leaves each frame's rotation wrong
+    distances: Array  # (F,) the same of translations, in the first's unit
+    scale_error: float  # standard error of the scale, relative
+    translation_error: float  # standard error of the translation, in the first's unit
 
 
 def fit_similarity(

@@ -25,19 +25,13 @@ from tracking3d.submaps.submap_runs import PartJob, Revisit, refine_submap, trac
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One call in a worker.
+    """One call in a worker."""
 
-    Attributes:
-        function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is estimated.
-        argument: What it is called with; it can be pickled, as can what is returned.
-        label: Its name for the user.
-        frames: Number of estimates it gives; 0 if unknown.
-    """
-
+    # called as function(tell, argument); tell takes the record of every frame that is estimated
     function: Callable[[Any, Any], Any]
-    argument: Any
-    label: str
-    frames: int = 0
+    argument: Any  # what it is called with; it can be pickled, as can what is returned
+    label: str  # its name for the user
+    frames: int = 0  # number of estimates it gives; 0 if unknown
 
 
 Steps = Generator[list[Step], list[Any], SplitResult]

@@ -34,27 +34,16 @@ Tell = Callable[[Any], None]
 
 @dataclass(frozen=True, eq=False)
 class PartJob:
-    """One part of a video, to be tracked.
+    """One part of a video, to be tracked."""
 
-    Attributes:
-        source: The video, as `open_source` takes it.
-        selection: Frames of the part, ``START:STOP:STEP``.
-        config: The pipeline.
-        folder: The part's run folder.
-        prompts: What the object is in its first frame.
-        command: For the record.
-        resume: Continue the run that is there.
-        first_pass_only: Stop when every frame has its causal estimate.
-    """
-
-    source: str
-    selection: str
-    config: PipelineConfig
-    folder: Path
-    prompts: PromptSet
-    command: str | None = None
-    resume: bool = False
-    first_pass_only: bool = True
+    source: str  # the video, as `open_source` takes it
+    selection: str  # frames of the part, START:STOP:STEP
+    config: PipelineConfig  # the pipeline
+    folder: Path  # the part's run folder
+    prompts: PromptSet  # what the object is in its first frame
+    command: str | None = None  # for the record
+    resume: bool = False  # continue the run that is there
+    first_pass_only: bool = True  # stop when every frame has its causal estimate
 
 
 def track_part(tell: Tell, job: PartJob) -> None:
@@ -85,25 +74,15 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Revisit:
-    """Frames of the merged run, to be refined against the merged object.
+    """Frames of the merged run, to be refined against the merged object."""
 
-    Attributes:
-        source: The video.
-        whole: All selected frames of it, ``START:STOP:STEP``, or None.
-        selection: The frames that are looked at.
-        config: The pipeline.
-        folder: The folder of the merged run.
-        prompts: What the object is in the video's first frame.
-        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the refined estimates.
-    """
-
-    source: str
-    whole: str | None
-    selection: str
-    config: PipelineConfig
-    folder: Path
-    prompts: PromptSet
-    out: Path
+    source: str  # the video
+    whole: str | None  # all selected frames of it, START:STOP:STEP, or None
+    selection: str  # the frames that are looked at
+    config: PipelineConfig  # the pipeline
+    folder: Path  # the folder of the merged run
+    prompts: PromptSet  # what the object is in the video's first frame
+    out: Path  # folder that gets masks/ and frames.jsonl of the refined estimates
 
 
 def refine_submap(tell: Tell, job: Revisit) -> int:

@@ -36,54 +36,35 @@ SURFACES: dict[str, ConvexSurface] = {
 
 @dataclass(frozen=True)
 class SyntheticSpec:
-    """What to synthesize.
+    """What to synthesize."""
 
-    Attributes:
-        shape: ``box``; ``chamfered_box``, whose corners are cut off; or ``ellipsoid``.
-        frames: Number of frames.
-        size: ``(width, height)`` in pixels.
-        degrees_per_frame: Rotation from each frame to the next.
-        axis: Axis of that rotation in camera axes, of any length.
-        drift: Movement in x, y and z from the first frame to the last, in object radii.
-        fill: Diameter of the object's enclosing sphere in the first frame relative to the image height.
-        fov: Vertical field of view in degrees.
-        clutter: 0 for a plain background to 1 for a full one.
-        noise: Standard deviation of the image noise in grey levels.
-        supersample: Rays per pixel and axis; odd, so that one goes through the pixel's centre.
-        seed: Seed of textures, background and noise.
-    """
-
+    # box; chamfered_box, whose corners are cut off; or ellipsoid
     shape: Literal["box", "chamfered_box", "ellipsoid"] = "chamfered_box"
-    frames: int = 20
-    size: tuple[int, int] = (200, 160)
-    degrees_per_frame: float = 2.0
+    frames: int = 20  # number of frames
+    size: tuple[int, int] = (200, 160)  # (width, height) in pixels
+    degrees_per_frame: float = 2.0  # rotation from each frame to the next
+    # axis of that rotation in camera axes, of any length
     axis: tuple[float, float, float] = (-0.3, 1.0, -0.15)
+    # movement in x, y and z from the first frame to the last, in object radii
     drift: tuple[float, float, float] = (0.4, -0.2, 0.4)
+    # diameter of the object's enclosing sphere in the first frame relative to the image height
     fill: float = 0.6
-    fov: float = DEFAULT_FIELD_OF_VIEW
-    clutter: float = 1.0
-    noise: float = 2.0
-    supersample: int = 3
-    seed: int = 0
+    fov: float = DEFAULT_FIELD_OF_VIEW  # vertical field of view in degrees
+    clutter: float = 1.0  # 0 for a plain background to 1 for a full one
+    noise: float = 2.0  # standard deviation of the image noise in grey levels
+    supersample: int = 3  # rays per pixel and axis; odd, so that one goes through the pixel's centre
+    seed: int = 0  # seed of textures, background and noise
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticClip:
-    """Images and their truth.
+    """Images and their truth."""
 
-    Attributes:
-        images: ``(N, H, W, 3)`` uint8 RGB.
-        masks: ``(N, H, W)`` bool.
-        T_cam_obj: ``(N, 4, 4)`` float64.
-        camera: The camera of all frames.
-        surface: The object, in object coordinates.
-    """
-
-    images: NDArray[np.uint8]
-    masks: NDArray[np.bool_]
-    T_cam_obj: NDArray[np.float64]
-    camera: Camera
-    surface: ConvexSurface
+    images: NDArray[np.uint8]  # (N, H, W, 3) uint8 RGB
+    masks: NDArray[np.bool_]  # (N, H, W) bool
+    T_cam_obj: NDArray[np.float64]  # (N, 4, 4) float64
+    camera: Camera  # the camera of all frames
+    surface: ConvexSurface  # the object, in object coordinates
 
     @property
     def K(self) -> NDArray[np.float64]:

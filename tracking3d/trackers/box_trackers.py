@@ -17,15 +17,10 @@ from tracking3d.trackers.lookahead import Lookahead
 
 @dataclass(frozen=True)
 class BoxOffset:
-    """How the object's box lies to the one that a tracker follows, which keeps to what it was started on.
+    """How the object's box lies to the one that a tracker follows, which keeps to what it was started on."""
 
-    Attributes:
-        shift: Shift of the corner, in widths and heights of the box.
-        factor: Factor of width and height.
-    """
-
-    shift: tuple[float, float] = (0.0, 0.0)
-    factor: tuple[float, float] = (1.0, 1.0)
+    shift: tuple[float, float] = (0.0, 0.0)  # shift of the corner, in widths and heights of the box
+    factor: tuple[float, float] = (1.0, 1.0)  # factor of width and height
 
     @classmethod
     def between(cls, followed: Box, told: Box) -> Self:

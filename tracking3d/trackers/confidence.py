@@ -22,19 +22,14 @@ _USUAL_AGREEMENT = 0.75  # used if there is no box tracker
 
 @dataclass(frozen=True)
 class Judgement:
-    """What tells a good mask from a bad one.
+    """What tells a good mask from a bad one."""
 
-    Attributes:
-        separation: How much better than its surroundings the mask fits the first frame's colours, in [-1, 1].
-        margin: The same just inside and outside the outline, by all the evidence but the prior, in [-1, 1].
-        agreement: IoU of the mask's box and the box tracker's; None without a box tracker.
-        believed: False if the propagated last mask replaces a segmentation that changed too much.
-    """
-
+    # how much better than its surroundings the mask fits the first frame's colours, in [-1, 1]
     separation: float
+    # the same just inside and outside the outline, by all the evidence but the prior, in [-1, 1]
     margin: float
-    agreement: float | None = None
-    believed: bool = True
+    agreement: float | None = None  # IoU of the mask's box and the box tracker's; None without a box tracker
+    believed: bool = True  # false if the propagated last mask replaces a segmentation that changed too much
 
     @property
     def score(self) -> float:

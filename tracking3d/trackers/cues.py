@@ -24,33 +24,21 @@ _SMOOTHNESS, _EDGES = 100.0, 12.0  # lambda and sigma of the fast global smoothe
 
 @dataclass(frozen=True)
 class Cues:
-    """The weights of what a pixel's log-odds are made of; 0 or False switches a cue off.
+    """The weights of what a pixel's log-odds are made of; 0 or False switches a cue off."""
 
-    Attributes:
-        prior: Distance to the outline of the moved mask.
-        outline: Weight in the prior of the last outline, shifted only; the mask moved by flow has weight 1.
-        similarity: Whether the mask moved by one similarity has weight 1 in the prior, too.
-        global_colours: Colours of the whole object and of its surroundings, remembered.
-        local_colours: Colours nearby, one frame ago.
-        motion: Whether the pixel moves with the object or with the background.
-        background: Whether the pixel has changed against what was seen there before.
-        novelty: For the object, within the outline, where nothing else is known: it may be a new side.
-        box: Distance beyond the box tracker's box.
-        network: Log-odds of a segmentation network, if there is one.
-        smoother: Whether the edge-aware smoother follows.
-    """
-
-    prior: float = 1.5
+    prior: float = 1.5  # distance to the outline of the moved mask
+    # weight in the prior of the last outline, shifted only; the mask moved by flow has weight 1
     outline: float = 2.0
-    similarity: bool = True
-    global_colours: float = 1.0
-    local_colours: float = 1.0
-    motion: float = 2.0
-    background: float = 1.0
+    similarity: bool = True  # whether the mask moved by one similarity has weight 1 in the prior, too
+    global_colours: float = 1.0  # colours of the whole object and of its surroundings, remembered
+    local_colours: float = 1.0  # colours nearby, one frame ago
+    motion: float = 2.0  # whether the pixel moves with the object or with the background
+    background: float = 1.0  # whether the pixel has changed against what was seen there before
+    # for the object, within the outline, where nothing else is known: it may be a new side
     novelty: float = 2.0
-    box: float = 1.0
-    network: float = 0.0
-    smoother: bool = True
+    box: float = 1.0  # distance beyond the box tracker's box
+    network: float = 0.0  # log-odds of a segmentation network, if there is one
+    smoother: bool = True  # whether the edge-aware smoother follows
 
     def favour_colours(self, share: float) -> Self:
         """The weights where colours tell the object from its surroundings: they count more, a network less.
@@ -69,19 +57,12 @@ class Cues:
 
 @dataclass(frozen=True, eq=False)
 class FrameCrop:
-    """A frame seen through a square window.
+    """A frame seen through a square window."""
 
-    Attributes:
-        window: The window.
-        image: ``(S, S, 3)`` RGB.
-        colours: ``(S, S, 3)`` Lab.
-        in_frame: ``(S, S)`` bool, what is not beyond the frame.
-    """
-
-    window: Window
-    image: NDArray[np.uint8]
-    colours: NDArray[np.uint8]
-    in_frame: NDArray[np.bool_]
+    window: Window  # the window
+    image: NDArray[np.uint8]  # (S, S, 3) RGB
+    colours: NDArray[np.uint8]  # (S, S, 3) Lab
+    in_frame: NDArray[np.bool_]  # (S, S) bool, what is not beyond the frame
 
     @classmethod
     def of(cls, frame: Image, window: Window) -> Self:

@@ -26,12 +26,9 @@ _SUFFIXES = frozenset((
 
 
 class MaskFiles(Protocol):
-    """Masks in their natural order.
+    """Masks in their natural order."""
 
-    Attributes:
-        names: What each mask is called, without folder and suffix; empty if masks are only in order.
-    """
-
+    # what each mask is called, without folder and suffix; empty if masks are only in order
     names: Sequence[str]
 
     def read(self, position: int) -> NDArray[np.bool_] | None:

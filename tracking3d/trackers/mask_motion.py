@@ -27,22 +27,16 @@ have to agree with a similarity as with a background that stands still."""
 
 @dataclass(frozen=True, eq=False)
 class MaskMotion:
-    """The last mask carried into the present crop.
+    """The last mask carried into the present crop."""
 
-    Attributes:
-        source: ``(S, S, 2)`` float32, where each present pixel was in the last crop, (x, y).
-        by_flow: ``(S, S)`` float32 in [0, 1], the last mask warped by the flow.
-        by_similarity: ``(S, S)`` float32 in [0, 1], the last mask moved by one similarity.
-        cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
-            the background's; 0 if it is unknown.
-        background: ``(3, 3)``, the background's homography from present to last pixels, a similarity where that
-            explains as much; None if it is unknown.
-    """
-
-    source: NDArray[np.float32]
-    by_flow: NDArray[np.float32]
-    by_similarity: NDArray[np.float32]
+    source: NDArray[np.float32]  # (S, S, 2) float32, where each present pixel was in the last crop, (x, y)
+    by_flow: NDArray[np.float32]  # (S, S) float32 in [0, 1], the last mask warped by the flow
+    by_similarity: NDArray[np.float32]  # (S, S) float32 in [0, 1], the last mask moved by one similarity
+    # (S, S) float32 pixels: how much better a pixel's motion fits the object's affine motion than the
+    # background's; 0 if it is unknown
     cue: NDArray[np.float32]
+    # (3, 3), the background's homography from present to last pixels, a similarity where that explains as
+    # much; None if it is unknown
     background: NDArray[np.float64] | None
 
     @property

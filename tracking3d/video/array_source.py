@@ -20,21 +20,16 @@ class ArraySource:
     """Any iterable of images, taken one at a time.
 
     See `tracking3d.video.source.FrameSource` for the other attributes.
-
-    Attributes:
-        images: ``(H, W, 3)`` uint8 RGB arrays of one size; frames of another size are skipped.
-        selection: Which of them are taken.
-        rate: Images per second, which times are counted by; None if unknown.
-        convert: Makes such an array of an item, given its position. The items may then also be `Frame` and
-            `SkippedFrame`, and sizes are left to whoever takes the frames.
     """
 
-    images: Iterable[Any]
-    selection: range = EVERY_FRAME
+    images: Iterable[Any]  # (H, W, 3) uint8 RGB arrays of one size; frames of another size are skipped
+    selection: range = EVERY_FRAME  # which of them are taken
     name: str = "the iterable of frames"
-    rate: float | None = None
+    rate: float | None = None  # images per second, which times are counted by; None if unknown
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+    # Makes such an array of an item, given its position. The items may then also be `Frame` and
+    # `SkippedFrame`, and sizes are left to whoever takes the frames.
     convert: Callable[[Any, int], Image] | None = None
 
     @property

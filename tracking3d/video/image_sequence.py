@@ -63,10 +63,6 @@ class ImageSequence:
     """Image files as the frames of a video.
 
     See `tracking3d.video.source.FrameSource` for the other attributes.
-
-    Attributes:
-        rate: Images per second of all files, selected or not, which their times are counted by; None if nobody
-            knows.
     """
 
     name: str
@@ -74,6 +70,7 @@ class ImageSequence:
     selection: range
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+    # images per second of all files, selected or not, which their times are counted by; None if nobody knows
     rate: float | None = None
     repeatable: bool = True
     notes: tuple[str, ...] = ()

@@ -31,16 +31,14 @@ class LatestFrames:
 
     See `tracking3d.video.source.FrameSource` for the other attributes.
 
-    Attributes:
-        source: Gives the frames; `tracking3d.video.open_source` makes one of any iterable of arrays.
-        rate: Frames a second at which the source is played, as a camera would, for tests and measurements; a frame's
-            time is then when it came, in seconds since the first. None takes them as they come.
-
     Raises:
         InputError: If the rate is not positive.
     """
 
+    # gives the frames; `tracking3d.video.open_source` makes one of any iterable of arrays
     source: FrameSource
+    # Frames a second at which the source is played, as a camera would, for tests and measurements; a frame's
+    # time is then when it came, in seconds since the first. None takes them as they come.
     rate: float | None = None
 
     def __post_init__(self) -> None:

@@ -81,13 +81,9 @@ def open_stream(address: str, selection: range = EVERY_FRAME) -> NetworkFile | L
 
 @dataclass(frozen=True, eq=False)
 class NetworkFile(VideoFile):
-    """A file on a web server, read as often as it is gone through.
+    """A file on a web server, read as often as it is gone through."""
 
-    Attributes:
-        address: With what it takes to be let in.
-    """
-
-    address: str = ""
+    address: str = ""  # with what it takes to be let in
 
     def container(self) -> InputContainer:
         """See `VideoFile.container`."""

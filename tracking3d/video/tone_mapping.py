@@ -38,15 +38,10 @@ _FINE = 4095  # steps of light before it is encoded
 
 @dataclass(frozen=True)
 class ToneMapping:
-    """How pictures of one video become sRGB.
+    """How pictures of one video become sRGB."""
 
-    Attributes:
-        transfer: ``"PQ"``, ``"HLG"``, or ``"SDR"`` of wide colours that need no rolling off.
-        wide: Whether primaries are BT.2020's.
-    """
-
-    transfer: str
-    wide: bool
+    transfer: str  # "PQ", "HLG", or "SDR" of wide colours that need no rolling off
+    wide: bool  # whether primaries are BT.2020's
 
     @property
     def said(self) -> str:

@@ -28,24 +28,19 @@ class VideoFile:
 
     See `tracking3d.video.source.FrameSource` for the other attributes. Frames are turned upright as the file asks
     for, deinterlaced, and tone-mapped to sRGB; their times are the file's own, so that a variable frame rate is kept.
-
-    Attributes:
-        path: Where it lies.
-        interlaced: Whether its first picture is interlaced.
-        notes: What was done to the pictures, in clauses.
-        counted: Whether the header states how many frames there are; else ``count`` comes from duration and rate.
     """
 
     name: str
-    path: Path
+    path: Path  # where it lies
     selection: range
     count: int | None
     fps: float | None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
     repeatable: bool = True
-    interlaced: bool = False
-    notes: tuple[str, ...] = ()
+    interlaced: bool = False  # whether its first picture is interlaced
+    notes: tuple[str, ...] = ()  # what was done to the pictures, in clauses
+    # whether the header states how many frames there are; else count comes from duration and rate
     counted: bool = False
 
     @property

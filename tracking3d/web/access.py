@@ -44,14 +44,10 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """Where a server listens, and whom it serves.
+    """Where a server listens, and whom it serves."""
 
-    Attributes:
-        host: The address that it listens on.
-        token: What has to be known besides; empty where only this machine can connect.
-    """
-
-    host: str = LOOPBACK
+    host: str = LOOPBACK  # the address that it listens on
+    # what has to be known besides; empty where only this machine can connect
     token: str = field(default="", repr=False)
 
     @classmethod

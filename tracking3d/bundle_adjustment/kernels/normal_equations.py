@@ -35,21 +35,13 @@ class BundleArrays(NamedTuple):
 
 
 class BundleEquations(NamedTuple):
-    """Normal equations of C unknowns of the poses and N points; written to.
+    """Normal equations of C unknowns of the poses and N points; written to."""
 
-    Attributes:
-        poses: ``(C, C)``.
-        points: ``(N, 3, 3)``.
-        coupling: ``(N, 3, C)``.
-        poses_gradient: ``(C,)``.
-        points_gradient: ``(N, 3)``.
-    """
-
-    poses: FloatArray
-    points: FloatArray
-    coupling: FloatArray
-    poses_gradient: FloatArray
-    points_gradient: FloatArray
+    poses: FloatArray  # (C, C)
+    points: FloatArray  # (N, 3, 3)
+    coupling: FloatArray  # (N, 3, C)
+    poses_gradient: FloatArray  # (C,)
+    points_gradient: FloatArray  # (N, 3)
 
 
 _BUNDLE = record(

@@ -42,13 +42,9 @@ _FIRST_WAIT = 0.03
 
 @dataclass(frozen=True)
 class MapInitialization(MapExtension):
-    """Makes the first map.
+    """Makes the first map."""
 
-    Attributes:
-        in_background: Whether the first map is computed in another thread; the result then depends on the
-            machine.
-    """
-
+    # whether the first map is computed in another thread; the result then depends on the machine
     in_background: bool = field(default=False, kw_only=True)
 
     def for_live_source(self) -> Self:

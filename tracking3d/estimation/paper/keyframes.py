@@ -18,17 +18,11 @@ from tracking3d.geometry.pose import Pose, rotation_angle
 
 @dataclass(frozen=True, eq=False)
 class KeyframeCandidate:
-    """A keyframe, or the current frame, as it stands after the optimization.
+    """A keyframe, or the current frame, as it stands after the optimization."""
 
-    Attributes:
-        pose: Its pose now.
-        silhouette_loss: ``L_S`` of this frame alone.
-        appearance_loss: ``L_F`` of this frame alone.
-    """
-
-    pose: Pose
-    silhouette_loss: float
-    appearance_loss: float
+    pose: Pose  # its pose now
+    silhouette_loss: float  # L_S of this frame alone
+    appearance_loss: float  # L_F of this frame alone
 
 
 def select_keyframes(

@@ -16,21 +16,14 @@ Free = Literal["all", "pose"]
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The result of an optimization.
+    """The result of an optimization."""
 
-    Attributes:
-        parameters: The estimate: the best state so far, or the initial one if the optimization failed numerically.
-        losses: The terms at the estimate.
-        total: Their weighted sum.
-        iterations: Number of evaluations.
-        reason: Empty, or why there is no usable estimate.
-    """
-
+    # the estimate: the best state so far, or the initial one if the optimization failed numerically
     parameters: Parameters
-    losses: Losses
-    total: float
-    iterations: int
-    reason: str = ""
+    losses: Losses  # the terms at the estimate
+    total: float  # their weighted sum
+    iterations: int  # number of evaluations
+    reason: str = ""  # empty, or why there is no usable estimate
 
 
 def optimize(

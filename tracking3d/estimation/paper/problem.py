@@ -17,19 +17,12 @@ from tracking3d.rendering import Rendering, SoftBand, render, sample_texture, te
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Everything that is estimated.
+    """Everything that is estimated."""
 
-    Attributes:
-        translation: ``(B, 3)`` of each frame's ``T_cam_obj``.
-        quaternion: ``(B, 4)`` of each frame's ``T_cam_obj``, w first.
-        offsets: ``(V, 3)`` from the prototype.
-        texture: ``(C, T, T)`` feature texture; fastest with its channels side by side in memory.
-    """
-
-    translation: Tensor
-    quaternion: Tensor
-    offsets: Tensor
-    texture: Tensor
+    translation: Tensor  # (B, 3) of each frame's T_cam_obj
+    quaternion: Tensor  # (B, 4) of each frame's T_cam_obj, w first
+    offsets: Tensor  # (V, 3) from the prototype
+    texture: Tensor  # (C, T, T) feature texture; fastest with its channels side by side in memory
 
     @property
     def poses(self) -> Pose:
@@ -80,24 +73,17 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """One batch of frames to explain.
+    """One batch of frames to explain."""
 
-    Attributes:
-        shape: The object's fixed part.
-        batch: The frames in order of time, the current one last.
-        config: Constants and weights.
-        seen: ``(1, T, T)`` how far each texel is known, in [0, 1]; None if that makes no difference.
-        previous: Where eq. 3 measures motion from: pose and frame index of the last keyframe. None takes it
-            from the batch's last but one frame; there is no motion term if there is none.
-        backend: Which renderer, see `tracking3d.rendering.backend`.
-    """
-
-    shape: Shape
-    batch: ObservationBatch
-    config: PaperConfig
+    shape: Shape  # the object's fixed part
+    batch: ObservationBatch  # the frames in order of time, the current one last
+    config: PaperConfig  # constants and weights
+    # (1, T, T) how far each texel is known, in [0, 1]; None if that makes no difference
     seen: Tensor | None = None
+    # Where eq. 3 measures motion from: pose and frame index of the last keyframe. None takes it from the
+    # batch's last but one frame; there is no motion term if there is none.
     previous: tuple[Pose, int] | None = None
-    backend: str = "auto"
+    backend: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
 
     def rendering(self, parameters: Parameters) -> Rendering:
         """Render all frames."""

@@ -29,38 +29,23 @@ class PosedObservation:
 
 @dataclass(frozen=True, eq=False)
 class PaperState:
-    """What the solver knows.
+    """What the solver knows."""
 
-    Attributes:
-        camera: The camera of the video.
-        shape: The fixed part of the object.
-        texels: Where each texel lies on the surface.
-        offsets: ``(V, 3)`` vertex offsets from the prototype.
-        texture: ``(C, T, T)`` feature texture.
-        keyframes: In order of time.
-        seen: RGB that former keyframes showed of each texel.
-        last: Pose and index of the last frame, a lost one's included.
-        before: The same of the frame before that one; None if there is no motion to go on with.
-        waiting: First frames that wait for the joint start, with their answers so far; None when none waits
-            any more.
-        started: Whether the first frame is done.
-        space: What is made of the encoder's features; None leaves them as they are.
-        renderer: Which renderer, see `tracking3d.rendering.backend`.
-    """
-
-    camera: Camera
-    shape: Shape
-    texels: TexelMap
-    offsets: Tensor
-    texture: Tensor
-    keyframes: tuple[PosedObservation, ...]
-    seen: BackProjection
-    last: tuple[Pose, int]
+    camera: Camera  # the camera of the video
+    shape: Shape  # the fixed part of the object
+    texels: TexelMap  # where each texel lies on the surface
+    offsets: Tensor  # (V, 3) vertex offsets from the prototype
+    texture: Tensor  # (C, T, T) feature texture
+    keyframes: tuple[PosedObservation, ...]  # in order of time
+    seen: BackProjection  # RGB that former keyframes showed of each texel
+    last: tuple[Pose, int]  # pose and index of the last frame, a lost one's included
+    # the same of the frame before that one; None if there is no motion to go on with
     before: tuple[Pose, int] | None = None
+    # first frames that wait for the joint start, with their answers so far; None when none waits any more
     waiting: tuple[tuple[PosedObservation, FrameEstimate], ...] | None = None
-    started: bool = False
-    space: FeatureSpace | None = None
-    renderer: str = "auto"
+    started: bool = False  # whether the first frame is done
+    space: FeatureSpace | None = None  # what is made of the encoder's features; None leaves them as they are
+    renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
 
     @property
     def vertices(self) -> Tensor:

@@ -29,35 +29,21 @@ class AlignedPlanes(NamedTuple):
 
 
 class AlignmentSettings(NamedTuple):
-    """How patches are aligned.
+    """How patches are aligned."""
 
-    Attributes:
-        window: ``(S, S)`` weights of a patch's pixels.
-        prior: Deviation in pixels of the shifts that are expected.
-        noise: Deviation of grey values that say the same.
-        least_cover: Share of the window in which the template has to be known.
-        steps: The most that are taken.
-    """
-
-    window: NDArray[np.float64]
-    prior: float
-    noise: float
-    least_cover: float
-    steps: int
+    window: NDArray[np.float64]  # (S, S) weights of a patch's pixels
+    prior: float  # deviation in pixels of the shifts that are expected
+    noise: float  # deviation of grey values that say the same
+    least_cover: float  # share of the window in which the template has to be known
+    steps: int  # the most that are taken
 
 
 class AlignmentArrays(NamedTuple):
-    """What is found out of N points, written to.
+    """What is found out of N points, written to."""
 
-    Attributes:
-        shift: ``(N, 2)``.
-        covariance: ``(N, 3)`` as xx, xy, yy.
-        agreement: ``(N, 2)``: correlation, and contrast of the template.
-    """
-
-    shift: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    agreement: NDArray[np.float64]
+    shift: NDArray[np.float64]  # (N, 2)
+    covariance: NDArray[np.float64]  # (N, 3) as xx, xy, yy
+    agreement: NDArray[np.float64]  # (N, 2): correlation, and contrast of the template
 
 
 _PLANES = record(AlignedPlanes, float32[:, ::1], float32[:, ::1], float32[:, ::1])

@@ -25,19 +25,12 @@ _TINY = np.finfo(np.float32).tiny
 
 
 class PairArrays(NamedTuple):
-    """Pairs of a face and a pixel that it is near to.
+    """Pairs of a face and a pixel that it is near to."""
 
-    Attributes:
-        counts: ``(B, 2)`` of boxes and of pairs in each view.
-        ends: ``(B + 1,)`` where the memory for the pairs of every view begins and ends.
-        places: ``(M, 3)`` the pixel, and the nearest edge's two corners.
-        slopes: ``(M, 3)`` t, the nearest place on the edge, and ``factor r``.
-    """
-
-    counts: NDArray[np.int64]
-    ends: NDArray[np.int64]
-    places: NDArray[np.int32]
-    slopes: NDArray[np.float32]
+    counts: NDArray[np.int64]  # (B, 2) of boxes and of pairs in each view
+    ends: NDArray[np.int64]  # (B + 1,) where the memory for the pairs of every view begins and ends
+    places: NDArray[np.int32]  # (M, 3) the pixel, and the nearest edge's two corners
+    slopes: NDArray[np.float32]  # (M, 3) t, the nearest place on the edge, and factor r
 
 
 _PAIRS = record(PairArrays, int64[:, ::1], int64[::1], int32[:, ::1], float32[:, ::1])

@@ -16,13 +16,10 @@ _APART = 0.1  # drop of the IoU of the mask's box and the box tracker's
 
 @dataclass
 class NetworkSchedule:
-    """Decides in which frames the network is run.
+    """Decides in which frames the network is run."""
 
-    Attributes:
-        every: It is run in every k-th frame; ``auto``: if something has changed since its last mask, and in every
-            sixth frame.
-    """
-
+    # it is run in every k-th frame; auto: if something has changed since its last mask, and in every sixth
+    # frame
     every: int | Literal["auto"]
     _frames: int = 0
     _size: Box | None = None

@@ -24,15 +24,10 @@ _MAX_FORWARD_BACKWARD_ERROR = 0.7  # largest forward-backward error in pixels
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
-    """Points of the surface in one frame.
+    """Points of the surface in one frame."""
 
-    Attributes:
-        landmark: ``(N,)`` int64, the index of each point's landmark.
-        pixel: ``(N, 2)`` float32 in the full frame.
-    """
-
-    landmark: NDArray[np.int64]
-    pixel: NDArray[np.float32]
+    landmark: NDArray[np.int64]  # (N,) int64, the index of each point's landmark
+    pixel: NDArray[np.float32]  # (N, 2) float32 in the full frame
 
     @classmethod
     def none(cls) -> FollowedPoints:

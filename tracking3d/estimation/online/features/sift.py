@@ -21,15 +21,10 @@ _SAME_CORNER = 2.0  # pixels within which keypoints are one corner, at several s
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one frame. A corner with two orientations occurs twice, since either descriptor may match.
+    """Keypoints of one frame. A corner with two orientations occurs twice, since either descriptor may match."""
 
-    Attributes:
-        pixel: ``(M, 2)`` float32 in the full frame.
-        descriptor: ``(M, 128)`` float32.
-    """
-
-    pixel: NDArray[np.float32]
-    descriptor: NDArray[np.float32]
+    pixel: NDArray[np.float32]  # (M, 2) float32 in the full frame
+    descriptor: NDArray[np.float32]  # (M, 128) float32
 
     @classmethod
     def none(cls) -> Keypoints:

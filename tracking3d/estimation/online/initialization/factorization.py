@@ -24,25 +24,15 @@ _UPGRADE_STEPS = 15
 
 @dataclass(frozen=True, eq=False)
 class AffineMotion:
-    """Points and frames under scaled orthography, with the depth still unknown.
+    """Points and frames under scaled orthography, with the depth still unknown."""
 
-    Attributes:
-        axes: ``(F, 3, 3)`` rotation of each frame that maps the points' centre onto the optical axis.
-        centres: ``(F, 3)`` direction of the points' centre in camera coordinates, with depth 1.
-        cameras: ``(F, 2, 3)``; that of frame 0 is ``[1 0 0; 0 1 0]``.
-        shape: ``(N, 3)`` x, y and zeta, which is uncorrelated with x and y and as wide as they are.
-        inliers: ``(N,)`` bool.
-        relief: Root mean square in pixels of the tracks' third dimension; 0 for a plane.
-        unexplained: Root mean square in pixels of the inliers' residuals to three dimensions.
-    """
-
-    axes: FloatArray
-    centres: FloatArray
-    cameras: FloatArray
-    shape: FloatArray
-    inliers: NDArray[np.bool_]
-    relief: float
-    unexplained: float
+    axes: FloatArray  # (F, 3, 3) rotation of each frame that maps the points' centre onto the optical axis
+    centres: FloatArray  # (F, 3) direction of the points' centre in camera coordinates, with depth 1
+    cameras: FloatArray  # (F, 2, 3); that of frame 0 is [1 0 0; 0 1 0]
+    shape: FloatArray  # (N, 3) x, y and zeta, which is uncorrelated with x and y and as wide as they are
+    inliers: NDArray[np.bool_]  # (N,) bool
+    relief: float  # root mean square in pixels of the tracks' third dimension; 0 for a plane
+    unexplained: float  # root mean square in pixels of the inliers' residuals to three dimensions
 
 
 def affine_motion(pixels: FloatArray, K: FloatArray, threshold: float, seed: int) -> AffineMotion | None:

@@ -24,15 +24,10 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ImageChange:
-    """A change between two frames.
+    """A change between two frames."""
 
-    Attributes:
-        outline: 1 - IoU of the aligned masks.
-        shading: Mean absolute difference of the aligned grey images inside both masks, in [0, 1].
-    """
-
-    outline: float
-    shading: float
+    outline: float  # 1 - IoU of the aligned masks
+    shading: float  # mean absolute difference of the aligned grey images inside both masks, in [0, 1]
 
 
 def image_change(first: Observation, second: Observation) -> ImageChange:

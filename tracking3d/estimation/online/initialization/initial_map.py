@@ -58,23 +58,14 @@ _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
 @dataclass(frozen=True, eq=False)
 class InitialMap:
-    """One hypothesis of the initialization.
+    """One hypothesis of the initialization."""
 
-    Attributes:
-        object_map: The map; its keyframes are the selected views.
-        cost: Cost of re-rendering the views, increased if the focal length is far from the assumed one.
-        bundle: Cost of the points' reprojection.
-        origin: The hypothesis that it came from.
-        camera: The camera that it was estimated with.
-        overlap: Mean IoU of the silhouettes with the masks.
-    """
-
-    object_map: ObjectMap
-    cost: float
-    bundle: float
-    origin: str
-    camera: Camera
-    overlap: float = 1.0
+    object_map: ObjectMap  # the map; its keyframes are the selected views
+    cost: float  # cost of re-rendering the views, increased if the focal length is far from the assumed one
+    bundle: float  # cost of the points' reprojection
+    origin: str  # the hypothesis that it came from
+    camera: Camera  # the camera that it was estimated with
+    overlap: float = 1.0  # mean IoU of the silhouettes with the masks
 
 
 def solve_start(

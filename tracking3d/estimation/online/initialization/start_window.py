@@ -22,21 +22,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class _Window:
-    """Points that are followed from one frame on.
+    """Points that are followed from one frame on."""
 
-    Attributes:
-        start: Index of the frame.
-        area: Pixels of its mask.
-        first: ``(N, 2)`` the points there.
-        points: Those that are followed still; their numbers are rows of ``first``.
-        score: See `score_starts`, without the area.
-    """
-
-    start: int
-    area: int
-    first: NDArray[np.float32]
+    start: int  # index of the frame
+    area: int  # pixels of its mask
+    first: NDArray[np.float32]  # (N, 2) the points there
+    # those that are followed still; their numbers are rows of first
     points: FollowedPoints = field(default_factory=FollowedPoints.none)
-    score: float = 0.0
+    score: float = 0.0  # see `score_starts`, without the area
 
 
 def score_starts(frames: Iterable[tuple[int, Image, Mask | None]]) -> dict[int, float]:

@@ -49,17 +49,12 @@ _FINEST_TEXELS, _TEXELS_OF_A_FACE = 512, 4.0
 
 @dataclass(frozen=True, eq=False)
 class RenderedSide:
-    """One side of an object, drawn.
+    """One side of an object, drawn."""
 
-    Attributes:
-        image: ``(S, S, 3)`` uint8.
-        mask: ``(S, S)`` its silhouette; known: where its colours are known.
-        points: ``(S, S, 3)`` surface points in object coordinates, at the pixels' centres; nan beside the object.
-    """
-
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (S, S, 3) uint8
+    mask: NDArray[np.bool_]  # (S, S) its silhouette; known: where its colours are known
     known: NDArray[np.bool_]
+    # (S, S, 3) surface points in object coordinates, at the pixels' centres; nan beside the object
     points: NDArray[np.float32]
 
 

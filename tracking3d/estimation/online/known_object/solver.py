@@ -43,12 +43,9 @@ class KnownObjectSolver(OnlineSolver):
 
     Until the object is detected, frames are estimated as lost, and each is searched. From then on it is the online
     solver, on a map whose shape is fixed.
-
-    Attributes:
-        known_object: The object.
     """
 
-    known_object: KnownObject
+    known_object: KnownObject  # the object
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take the first frame.

@@ -41,23 +41,15 @@ _MAX_SMALL_GAINS = 3  # in a row end the search; a single one often means only t
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The constants of one fit.
+    """The constants of one fit."""
 
-    Attributes:
-        object_map: The map that is fitted; modes, weights: As given.
-        K: ``(B, 3, 3)`` of the windows.
-        layers: See `layers_of`.
-        distance: ``(B, S, S)`` to the masks' outlines, pixels of the window.
-        mask_weight: ``(B,)`` how far each mask is trusted.
-    """
-
-    object_map: ObjectMap
+    object_map: ObjectMap  # the map that is fitted; modes, weights: As given
     modes: ShapeBasis
     weights: FitWeights
-    K: Tensor
-    layers: Tensor
-    distance: Tensor
-    mask_weight: Tensor
+    K: Tensor  # (B, 3, 3) of the windows
+    layers: Tensor  # see `layers_of`
+    distance: Tensor  # (B, S, S) to the masks' outlines, pixels of the window
+    mask_weight: Tensor  # (B,) how far each mask is trusted
 
     @property
     def size(self) -> int:

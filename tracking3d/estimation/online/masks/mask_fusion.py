@@ -36,19 +36,13 @@ _UPSAMPLING = 2
 
 @dataclass(frozen=True, eq=False)
 class FusedMask:
-    """The mask of a frame's estimate.
+    """The mask of a frame's estimate."""
 
-    Attributes:
-        mask: ``(H, W)``.
-        source: Its source.
-        probability: ``(H, W)`` of the object; the mask is where it exceeds a half. None if the masks were not fused.
-        moving: Share of the mask that differs from the initial one because of the motion cue.
-    """
-
-    mask: NDArray[np.bool_]
-    source: MaskSource
+    mask: NDArray[np.bool_]  # (H, W)
+    source: MaskSource  # its source
+    # (H, W) of the object; the mask is where it exceeds a half. None if the masks were not fused.
     probability: NDArray[np.float32] | None = None
-    moving: float = 0.0
+    moving: float = 0.0  # share of the mask that differs from the initial one because of the motion cue
 
 
 def fuse_mask(

@@ -40,18 +40,12 @@ class PointEquations:
     """A quadratic model ``cost + gradient d + d matrix d / 2`` of the points' mean Cauchy loss in ``d = (v, w)``.
 
     As `tracking3d.rendering.NormalEquations`, of one frame, with ``t`` as pivot.
-
-    Attributes:
-        matrix: ``(6, 6)``.
-        gradient: ``(6,)``.
-        cost: By weight; a point behind the camera costs a large constant.
-        residual: ``(N,)`` distance in pixels; nan for points without weight or behind the camera.
     """
 
-    matrix: FloatArray
-    gradient: FloatArray
-    cost: float
-    residual: FloatArray
+    matrix: FloatArray  # (6, 6)
+    gradient: FloatArray  # (6,)
+    cost: float  # by weight; a point behind the camera costs a large constant
+    residual: FloatArray  # (N,) distance in pixels; nan for points without weight or behind the camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,17 +34,11 @@ _DEFAULT_WEIGHTS = PoseWeights()
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """The evidence that poses are fitted to, at one resolution.
+    """The evidence that poses are fitted to, at one resolution."""
 
-    Attributes:
-        observation: The frame at this resolution.
-        matched: With pixels of this resolution; None without any.
-        weights: With scales in pixels of this resolution.
-    """
-
-    observation: Observation
-    matched: MatchedPoints | None
-    weights: PoseWeights
+    observation: Observation  # the frame at this resolution
+    matched: MatchedPoints | None  # with pixels of this resolution; None without any
+    weights: PoseWeights  # with scales in pixels of this resolution
 
     def half(self) -> _Evidence:
         """At half the resolution."""

@@ -29,30 +29,20 @@ _ROUNDS = 3  # of the robust means
 
 @dataclass(frozen=True, eq=False)
 class SharedFaces:
-    """What B views show of the faces that two views or more show, C channels.
+    """What B views show of the faces that two views or more show, C channels."""
 
-    Attributes:
-        cost: The mean Cauchy loss, of what one view alone shows too.
-        faces: ``(N,)`` int64, which they are.
-        corner: ``(N, B, 3, 3)`` in the cameras' axes; normal: ``(N, B, 3)``; length: ``(N, B, 1)``, twice their areas.
-        slopes: Two of ``(N, B, C)``, of the values by x and by y.
-        light: ``(C, 3)``.
-        residual: ``(N, B, C)``; used: ``(N, B, C)`` their weights as in the matrix of the Cauchy loss.
-        K: ``(B, 3, 3)``.
-        scale: Difference of features at which the loss is ``log 2``.
-    """
-
-    cost: float
-    faces: Tensor
+    cost: float  # the mean Cauchy loss, of what one view alone shows too
+    faces: Tensor  # (N,) int64, which they are
+    # (N, B, 3, 3) in the cameras' axes; normal: (N, B, 3); length: (N, B, 1), twice their areas
     corner: Tensor
     normal: Tensor
     length: Tensor
-    slopes: tuple[Tensor, Tensor]
-    light: Tensor
-    residual: Tensor
+    slopes: tuple[Tensor, Tensor]  # two of (N, B, C), of the values by x and by y
+    light: Tensor  # (C, 3)
+    residual: Tensor  # (N, B, C); used: (N, B, C) their weights as in the matrix of the Cauchy loss
     used: Tensor
-    K: Tensor
-    scale: float
+    K: Tensor  # (B, 3, 3)
+    scale: float  # difference of features at which the loss is log 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +51,13 @@ class FaceEquations:
 
     The G further unknowns are the poses' ``(v, w)``, six for each view, see `NormalEquations`, and the light's three
     for each channel.
-
-    Attributes:
-        faces: ``(N,)`` int64, the faces that two views or more show.
-        corners: ``(N, 9, 9)`` matrix in each face's corners, in object coordinates.
-        mixed: ``(N, 9, G)`` between corners and the rest; rest: ``(G, G)``.
-        by_corners: ``(N, 9)`` gradient; by_rest: ``(G,)``.
     """
 
-    faces: Tensor
-    corners: Tensor
-    mixed: Tensor
+    faces: Tensor  # (N,) int64, the faces that two views or more show
+    corners: Tensor  # (N, 9, 9) matrix in each face's corners, in object coordinates
+    mixed: Tensor  # (N, 9, G) between corners and the rest; rest: (G, G)
     rest: Tensor
-    by_corners: Tensor
+    by_corners: Tensor  # (N, 9) gradient; by_rest: (G,)
     by_rest: Tensor
 
 

@@ -23,15 +23,10 @@ _SAME = 1e-7  # eigenvalues that differ by a smaller share are one; rounding mak
 
 @dataclass(frozen=True, eq=False)
 class ShapeBasis:
-    """The lowest modes of a shape's Laplacian.
+    """The lowest modes of a shape's Laplacian."""
 
-    Attributes:
-        vectors: ``(V, M)`` float64 orthonormal columns.
-        bending: ``(M,)`` squared norm of each one's Laplacian.
-    """
-
-    vectors: Tensor
-    bending: Tensor
+    vectors: Tensor  # (V, M) float64 orthonormal columns
+    bending: Tensor  # (M,) squared norm of each one's Laplacian
 
     @classmethod
     def of(cls, shape: Shape, count: int = MODES) -> ShapeBasis:

@@ -32,52 +32,34 @@ _FLOOR = 1e-6  # added to the diagonal, as a share of its largest entry
 
 @dataclass(frozen=True)
 class FitWeights:
-    """The weights of the shape's terms.
+    """The weights of the shape's terms."""
 
-    Attributes:
-        outline: Weight of the mean squared distance of the outlines from the masks', in pixels, over all keyframes.
-        outline_scale: Pixels at which an outline's distance counts half (robust).
-        landmarks: Weight of the mean squared distance of the landmarks from the surface, in units of its scale.
-        landmarks_scale: Object units at which a landmark's distance counts half (robust).
-        smoothness: Weight of the mean squared Laplacian of the offsets.
-    """
-
+    # weight of the mean squared distance of the outlines from the masks', in pixels, over all keyframes
     outline: float = 1.0
-    outline_scale: float = 2.0
+    outline_scale: float = 2.0  # pixels at which an outline's distance counts half (robust)
+    # weight of the mean squared distance of the landmarks from the surface, in units of its scale
     landmarks: float = 2.0
-    landmarks_scale: float = 0.05
-    smoothness: float = 300.0
+    landmarks_scale: float = 0.05  # object units at which a landmark's distance counts half (robust)
+    smoothness: float = 300.0  # weight of the mean squared Laplacian of the offsets
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeKeyframes:
-    """The keyframes as the shape is fitted to them.
+    """The keyframes as the shape is fitted to them."""
 
-    Attributes:
-        R: ``(B, 3, 3)``; t: ``(B, 3)``; of ``T_cam_obj``.
-        K: ``(B, 3, 3)`` of the windows.
-        distance: ``(B, S, S)`` signed distance to the mask, pixels of the window.
-        weight: ``(B,)`` how far each frame's mask is trusted, in [0, 1].
-    """
-
-    R: Tensor
+    R: Tensor  # (B, 3, 3); t: (B, 3); of T_cam_obj
     t: Tensor
-    K: Tensor
-    distance: Tensor
-    weight: Tensor
+    K: Tensor  # (B, 3, 3) of the windows
+    distance: Tensor  # (B, S, S) signed distance to the mask, pixels of the window
+    weight: Tensor  # (B,) how far each frame's mask is trusted, in [0, 1]
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Points that the surface passes through, each seen in one of the views.
+    """Points that the surface passes through, each seen in one of the views."""
 
-    Attributes:
-        points: ``(N, 3)`` in object coordinates.
-        view: ``(N,)`` int64, a view that shows each.
-    """
-
-    points: Tensor
-    view: Tensor
+    points: Tensor  # (N, 3) in object coordinates
+    view: Tensor  # (N,) int64, a view that shows each
 
 
 def fit_surface(

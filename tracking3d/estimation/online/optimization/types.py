@@ -23,62 +23,36 @@ NOTHING_SEEN = 1.0
 
 @dataclass(frozen=True)
 class PoseWeights:
-    """The weights of the cost terms, and the scales of their robust losses.
+    """The weights of the cost terms, and the scales of their robust losses."""
 
-    Attributes:
-        appearance: Weight of the mean over the covered pixels in the mask and the frame.
-        appearance_scale: Difference of features at which the loss is ``log 2``.
-        outline: Weight of the mean along the outline.
-        outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        points: Weight of the mean over the matched points.
-        points_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        unseen: Cost of a covered pixel of unseen texture, in place of its loss.
-    """
-
-    appearance: float = 1.0
-    appearance_scale: float = 0.25
-    outline: float = 0.3
-    outline_scale: float = 2.0
-    points: float = 1.0
-    points_scale: float = 1.0
-    unseen: float = 0.5
+    appearance: float = 1.0  # weight of the mean over the covered pixels in the mask and the frame
+    appearance_scale: float = 0.25  # difference of features at which the loss is log 2
+    outline: float = 0.3  # weight of the mean along the outline
+    outline_scale: float = 2.0  # pixels at full working resolution at which the loss is log 2
+    points: float = 1.0  # weight of the mean over the matched points
+    points_scale: float = 1.0  # pixels at full working resolution at which the loss is log 2
+    unseen: float = 0.5  # cost of a covered pixel of unseen texture, in place of its loss
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A pose and how well it explains the frame.
+    """A pose and how well it explains the frame."""
 
-    Attributes:
-        pose: The pose of the frame.
-        cost: What was minimized.
-        appearance: Mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged.
-        outline: Mean Cauchy loss of the outline; 0 without a mask.
-        points: Mean Cauchy loss of the matched points; 0 without any.
-        overlap: IoU of what is covered with the mask, inside the frame; 1 without a mask.
-        unseen: Share of the comparable pixels whose texture was never seen, in [0, 1].
-        information: ``(6, 6)`` matrix of the normal equations, see `tracking3d.rendering.NormalEquations`.
-        iterations: Evaluations spent.
-    """
-
-    pose: Pose
-    cost: float
+    pose: Pose  # the pose of the frame
+    cost: float  # what was minimized
+    # mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged
     appearance: float
-    outline: float
-    points: float
-    overlap: float
-    unseen: float
-    information: Tensor
-    iterations: int
+    outline: float  # mean Cauchy loss of the outline; 0 without a mask
+    points: float  # mean Cauchy loss of the matched points; 0 without any
+    overlap: float  # IoU of what is covered with the mask, inside the frame; 1 without a mask
+    unseen: float  # share of the comparable pixels whose texture was never seen, in [0, 1]
+    information: Tensor  # (6, 6) matrix of the normal equations, see `tracking3d.rendering.NormalEquations`
+    iterations: int  # evaluations spent
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedPoses:
-    """B poses with what they cost, see `PoseFit`: float64 arrays, each ``(B, ...)``.
-
-    Attributes:
-        spent: Evaluations that led to them, int64.
-        moved: Whether they differ from the initial poses, bool.
-    """
+    """B poses with what they cost, see `PoseFit`: float64 arrays, each ``(B, ...)``."""
 
     R: FloatArray
     t: FloatArray
@@ -90,8 +64,8 @@ class EvaluatedPoses:
     unseen: FloatArray
     matrix: FloatArray
     gradient: FloatArray
-    spent: NDArray[np.int64]
-    moved: NDArray[np.bool_]
+    spent: NDArray[np.int64]  # evaluations that led to them, int64
+    moved: NDArray[np.bool_]  # whether they differ from the initial poses, bool
 
     def __getitem__(self, places: NDArray[Any]) -> EvaluatedPoses:
         """Some of them."""

@@ -47,23 +47,14 @@ _WORST_RATIO, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """The evidence for a pose apart from its losses.
+    """The evidence for a pose apart from its losses."""
 
-    Attributes:
-        inliers: Inliers among the landmarks that at least two keyframes have seen.
-        outlier_ratio: Share of such landmarks in the frame that are outliers, in [0, 1].
-        mask_weight: How far the mask is trusted, in [0, 1].
-        has_mask: Whether there is one.
-        untextured: Whether the object has no points that could be tracked.
-        has_texture: Whether it has texture nevertheless, whose points were not found again.
-    """
-
-    inliers: int
-    outlier_ratio: float = 0.0
-    mask_weight: float = 1.0
-    has_mask: bool = True
-    untextured: bool = False
-    has_texture: bool = False
+    inliers: int  # inliers among the landmarks that at least two keyframes have seen
+    outlier_ratio: float = 0.0  # share of such landmarks in the frame that are outliers, in [0, 1]
+    mask_weight: float = 1.0  # how far the mask is trusted, in [0, 1]
+    has_mask: bool = True  # whether there is one
+    untextured: bool = False  # whether the object has no points that could be tracked
+    has_texture: bool = False  # whether it has texture nevertheless, whose points were not found again
 
     @property
     def is_decisive(self) -> bool:
@@ -76,19 +67,13 @@ class LossBaseline:
     """Running mean losses of tracked frames, clamped near those of the first `SETTLED` frames.
 
     Without the clamp a slow drift would raise the baseline and hide itself.
-
-    Attributes:
-        appearance: Appearance loss.
-        outline: Outline loss.
-        overlap: IoU with the mask.
-        frames: How many frames are in them.
-        sound: The three of them after the first `SETTLED` frames; None until then.
     """
 
-    appearance: float = 0.2
-    outline: float = 0.3
-    overlap: float = 0.9
-    frames: int = 0
+    appearance: float = 0.2  # appearance loss
+    outline: float = 0.3  # outline loss
+    overlap: float = 0.9  # IoU with the mask
+    frames: int = 0  # how many frames are in them
+    # the three of them after the first `SETTLED` frames; None until then
     sound: tuple[float, float, float] | None = None
 
     def update(self, fit: PoseFit) -> LossBaseline:

@@ -25,31 +25,22 @@ from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A frame with its pose and its landmark observations.
+    """A frame with its pose and its landmark observations."""
 
-    Attributes:
-        observation: Its window.
-        mask: ``(H, W)`` initial mask in the full frame, or None.
-        pose: The current pose.
-        points: Landmarks and their pixels in the frame.
-        keypoints: For matching; ``keypoint_landmark`` ``(M,)`` is the index of each one's landmark.
-        texture: The frame's back-projected feature texture, as last computed; None before.
-        mask_weight: How far the mask is trusted, in [0, 1].
-        strength: Texture strength inside the mask, if it was computed; see `texture_strength`.
-        image: The image around the object, for dense landmarks; None if there is no mask.
-        is_adjusted: Whether dense landmarks have adjusted the pose, so that local mapping keeps it.
-    """
-
-    observation: Observation
-    mask: NDArray[np.bool_] | None
-    pose: Pose
-    points: FollowedPoints
+    observation: Observation  # its window
+    mask: NDArray[np.bool_] | None  # (H, W) initial mask in the full frame, or None
+    pose: Pose  # the current pose
+    points: FollowedPoints  # landmarks and their pixels in the frame
+    # for matching; keypoint_landmark (M,) is the index of each one's landmark
     keypoints: Keypoints = field(default_factory=Keypoints.none)
     keypoint_landmark: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # the frame's back-projected feature texture, as last computed; None before
     texture: BackProjection | None = None
-    mask_weight: float = 1.0
-    strength: float = math.inf
+    mask_weight: float = 1.0  # how far the mask is trusted, in [0, 1]
+    strength: float = math.inf  # texture strength inside the mask, if it was computed; see `texture_strength`
+    # the image around the object, for dense landmarks; None if there is no mask
     image: GreyWindow | None = None
+    # whether dense landmarks have adjusted the pose, so that local mapping keeps it
     is_adjusted: bool = False
 
     @property
@@ -60,38 +51,29 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMap:
-    """The map of the object.
+    """The map of the object."""
 
-    Attributes:
-        shape: The topology and prototype, which never change.
-        texels: Where each texel lies on the surface.
-        vertices: ``(V, 3)``.
-        landmarks: ``(N, 3)`` float64 surface points in object coordinates.
-        keyframes: In order of time; the first one's pose is fixed.
-        candidate: ``(N,)`` whether a landmark was found outside the mask and is not yet known to be on the object.
-        pointless: Whether the object has no points that can be tracked: only pixels and outlines constrain it.
-        renderer: Which renderer, see `tracking3d.rendering.backend`.
-        candidates_around: ``(8, 2)`` candidate landmarks in each direction from the object: those that could be tested,
-            and those that move with it.
-        fixed_keyframes: How many of the first keyframes are rendered from an object that was known before. Its shape is
-            fixed, and its surface points count as seen often. 0 if the map is built from the video.
-        started_at_rest: Whether the object was still when tracking began: until it has turned, the things next to it
-            move in the image as it does.
-        asked_landmarks: Index of the newest keyframe when dense landmarks were last asked to refine the map; -1 if they
-            never were.
-    """
-
-    shape: Shape
-    texels: TexelMap
-    vertices: Tensor
-    landmarks: NDArray[np.float64]
-    keyframes: tuple[Keyframe, ...]
+    shape: Shape  # the topology and prototype, which never change
+    texels: TexelMap  # where each texel lies on the surface
+    vertices: Tensor  # (V, 3)
+    landmarks: NDArray[np.float64]  # (N, 3) float64 surface points in object coordinates
+    keyframes: tuple[Keyframe, ...]  # in order of time; the first one's pose is fixed
+    # (N,) whether a landmark was found outside the mask and is not yet known to be on the object
     candidate: NDArray[np.bool_]
+    # whether the object has no points that can be tracked: only pixels and outlines constrain it
     pointless: bool = False
-    renderer: str = "auto"
+    renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
+    # (8, 2) candidate landmarks in each direction from the object: those that could be tested, and those that
+    # move with it
     candidates_around: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
+    # How many of the first keyframes are rendered from an object that was known before. Its shape is fixed,
+    # and its surface points count as seen often. 0 if the map is built from the video.
     fixed_keyframes: int = 0
+    # whether the object was still when tracking began: until it has turned, the things next to it move in the
+    # image as it does
     started_at_rest: bool = False
+    # index of the newest keyframe when dense landmarks were last asked to refine the map; -1 if they never
+    # were
     asked_landmarks: int = -1
 
     @cached_property

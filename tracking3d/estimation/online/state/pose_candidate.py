@@ -15,23 +15,14 @@ from tracking3d.frames import TRACKED_CONFIDENCE
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """The result of estimating the object's pose in a frame.
+    """The result of estimating the object's pose in a frame."""
 
-    Attributes:
-        view: The frame.
-        fit: The pose and its losses.
-        hypothesis: The name of the winning hypothesis.
-        points: The pose's inliers.
-        evidence: The evidence for the pose apart from its losses.
-        assessment: The pose's assessment.
-    """
-
-    view: Keyframe
-    fit: PoseFit
-    hypothesis: str
-    points: FollowedPoints
-    evidence: PoseEvidence
-    assessment: Assessment
+    view: Keyframe  # the frame
+    fit: PoseFit  # the pose and its losses
+    hypothesis: str  # the name of the winning hypothesis
+    points: FollowedPoints  # the pose's inliers
+    evidence: PoseEvidence  # the evidence for the pose apart from its losses
+    assessment: Assessment  # the pose's assessment
 
     @property
     def lost(self) -> bool:

@@ -41,117 +41,80 @@ class SolverPhase(Enum):
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """How far the initial masks of the keyframes agree with each other.
+    """How far the initial masks of the keyframes agree with each other."""
 
-    Attributes:
-        weight: Of initial masks because of that, in [0, 1].
-        beyond: Median share of a keyframe's initial mask that lies beyond its silhouette.
-        keyframes: How many there were when that was measured.
-    """
-
-    weight: float = 0.0
-    beyond: float = 0.0
-    keyframes: int = 0
+    weight: float = 0.0  # of initial masks because of that, in [0, 1]
+    beyond: float = 0.0  # median share of a keyframe's initial mask that lies beyond its silhouette
+    keyframes: int = 0  # how many there were when that was measured
 
 
 @dataclass(frozen=True, eq=False)
 class InactiveMap:
-    """A map that the object is not tracked against now; its transform to the active map is unknown.
+    """A map that the object is not tracked against now; its transform to the active map is unknown."""
 
-    Attributes:
-        object_map: The map.
-        surface: Its surface.
-        baseline: The losses of the frames that were tracked against it.
-        spans: First and last index of the frames that were estimated with it.
-        unaligned: Whether its transform to the first map is only a guess.
-        mask_agreement: That of its keyframes.
-    """
-
-    object_map: ObjectMap
-    surface: Surface
-    baseline: LossBaseline
-    spans: tuple[tuple[int, int], ...]
-    unaligned: bool
-    mask_agreement: MaskAgreement = MaskAgreement()
+    object_map: ObjectMap  # the map
+    surface: Surface  # its surface
+    baseline: LossBaseline  # the losses of the frames that were tracked against it
+    spans: tuple[tuple[int, int], ...]  # first and last index of the frames that were estimated with it
+    unaligned: bool  # whether its transform to the first map is only a guess
+    mask_agreement: MaskAgreement = MaskAgreement()  # that of its keyframes
 
 
 @dataclass(frozen=True, eq=False)
 class SolverState:
-    """What the solver knows between two frames.
+    """What the solver knows between two frames."""
 
-    Attributes:
-        camera: The camera of the video.
-        object_map: The object's map.
-        surface: The map's surface, as poses are fitted to it.
-        last_pose: Pose and index of the last frame, also if the object was lost in it.
-        previous_pose: The same of the frame before it; None if no motion is known.
-        grey: ``(H, W)`` the last frame.
-        tracked_points: Points in the last frame.
-        pending: The frames that wait for the first map, with their estimates so far; None once there is a map.
-        feature_space: The projection of the encoder's features; None leaves them as they are.
-        next_attempt: The motion at which the next initialization is tried.
-        ambiguous_frames: How many frames the last initialization had if it was ambiguous; 0 if there was none.
-        ambiguous_rotation: ``(3,)`` the object's rotation in that initialization as a rotation vector, or None.
-        waiting_reason: Why the initialization waits, if not for motion.
-        baseline: The losses of tracked frames.
-        lost_frames: How many frames in a row the object has been lost; those without a mask, in which no hypothesis can
-            be tried, count as one.
-        doubtful_frames: How many frames in a row have been lost or of low confidence.
-        misfits: How many frames in a row a map without points has explained worse than its first ones.
-        restarts: How often it was begun again for that.
-        last_candidate: The best pose of the last frame, if that had a mask and the pose was rejected.
-        trajectory: Poses and indices of the last tracked frames, for the motion model.
-        colours: Colours of object and background in tracked frames.
-        motion_references: The last tracked frames, for the motion cue.
-        reinitialization: The state of a second initialization, which goes on while the object is lost and has a mask.
-        inactive_maps: The other maps of the object.
-        spans: First and last index of the earlier frames that were estimated with the active map.
-        active_since: Index of the frame from which the active map has been active.
-        unaligned: Whether the transform from the active map to the first one is only a guess.
-        reversal_attempt: How many keyframes there were, and how many degrees they spanned, when a depth reversal was
-            last tried.
-        mask_agreement: How far the initial masks of the keyframes agree with each other.
-        extended: Poses ``(4, 4)`` that were found when the largest map was extended over frames that it did not
-            explain, by frame index.
-        rested: Frames before the pending ones, in which the object did not turn yet; the first map gives them a pose.
-        repeatable: Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is begun again, they
-            are estimated again. Empty if it cannot be.
-        background: The initialization that is computed in another thread, if there is one; see
-            `tracking3d.estimation.online.map_initialization`.
-    """
-
-    camera: Camera
-    object_map: ObjectMap
-    surface: Surface | None
-    last_pose: tuple[Pose, int]
-    previous_pose: tuple[Pose, int] | None
-    grey: NDArray[np.uint8]
-    tracked_points: FollowedPoints
+    camera: Camera  # the camera of the video
+    object_map: ObjectMap  # the object's map
+    surface: Surface | None  # the map's surface, as poses are fitted to it
+    last_pose: tuple[Pose, int]  # pose and index of the last frame, also if the object was lost in it
+    previous_pose: tuple[Pose, int] | None  # the same of the frame before it; None if no motion is known
+    grey: NDArray[np.uint8]  # (H, W) the last frame
+    tracked_points: FollowedPoints  # points in the last frame
+    # the frames that wait for the first map, with their estimates so far; None once there is a map
     pending: tuple[tuple[Keyframe, FrameEstimate], ...] | None = ()
+    # the projection of the encoder's features; None leaves them as they are
     feature_space: FeatureSpace | None = None
-    next_attempt: float = 0.0
+    next_attempt: float = 0.0  # the motion at which the next initialization is tried
+    # how many frames the last initialization had if it was ambiguous; 0 if there was none
     ambiguous_frames: int = 0
+    # (3,) the object's rotation in that initialization as a rotation vector, or None
     ambiguous_rotation: NDArray[np.float64] | None = None
-    waiting_reason: str = ""
-    baseline: LossBaseline = field(default_factory=LossBaseline)
+    waiting_reason: str = ""  # why the initialization waits, if not for motion
+    baseline: LossBaseline = field(default_factory=LossBaseline)  # the losses of tracked frames
+    # how many frames in a row the object has been lost; those without a mask, in which no hypothesis can be
+    # tried, count as one
     lost_frames: int = 0
-    doubtful_frames: int = 0
-    misfits: int = 0
-    restarts: int = 0
+    doubtful_frames: int = 0  # how many frames in a row have been lost or of low confidence
+    misfits: int = 0  # how many frames in a row a map without points has explained worse than its first ones
+    restarts: int = 0  # how often it was begun again for that
+    # the best pose of the last frame, if that had a mask and the pose was rejected
     last_candidate: Pose | None = None
+    # poses and indices of the last tracked frames, for the motion model
     trajectory: tuple[tuple[Pose, int], ...] = ()
-    colours: ColourModels | None = None
-    motion_references: tuple[MotionReference, ...] = ()
+    colours: ColourModels | None = None  # colours of object and background in tracked frames
+    motion_references: tuple[MotionReference, ...] = ()  # the last tracked frames, for the motion cue
+    # the state of a second initialization, which goes on while the object is lost and has a mask
     reinitialization: SolverState | None = None
-    inactive_maps: tuple[InactiveMap, ...] = ()
+    inactive_maps: tuple[InactiveMap, ...] = ()  # the other maps of the object
+    # first and last index of the earlier frames that were estimated with the active map
     spans: tuple[tuple[int, int], ...] = ()
-    active_since: int = -1
-    unaligned: bool = False
+    active_since: int = -1  # index of the frame from which the active map has been active
+    unaligned: bool = False  # whether the transform from the active map to the first one is only a guess
+    # how many keyframes there were, and how many degrees they spanned, when a depth reversal was last tried
     reversal_attempt: tuple[int, float] = (0, 0.0)
+    # how far the initial masks of the keyframes agree with each other
     mask_agreement: MaskAgreement = MaskAgreement()
+    # poses (4, 4) that were found when the largest map was extended over frames that it did not explain, by
+    # frame index
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    # frames before the pending ones, in which the object did not turn yet; the first map gives them a pose
     rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is begun again, they are
+    # estimated again. Empty if it cannot be.
     repeatable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    # the initialization that is computed in another thread, if there is one; see
+    # `tracking3d.estimation.online.map_initialization`
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
