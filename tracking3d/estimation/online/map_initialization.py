@@ -84,11 +84,12 @@ class MapInitialization(MapExtension):
 
     def _initialize(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
         """Make the first map, and estimate all pending frames with it."""
-        assert state.pending is not None
-        if start.object_map.pointless and (space := state.feature_space) is not None:
-            state = replace(state, feature_space=(space := space.with_contrast()))
+        if start.object_map.pointless and state.feature_space is not None:
+            space = state.feature_space.with_contrast()
+            state = replace(state, feature_space=space)
             views = tuple(with_contrast(view, space) for view in start.object_map.keyframes)
             start = replace(start, object_map=replace(start.object_map, keyframes=views))
+        assert state.pending is not None
         everything = list(range(len(start.object_map.keyframes)))
         waiting, before, camera = (*state.rested, *state.pending), state.camera, start.camera
         with in_stage("map"):
