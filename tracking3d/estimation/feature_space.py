@@ -25,9 +25,7 @@ TAU = 0.5
 """Convergence threshold of the appearance loss of features with this spread: frames that are tracked well stay
 below 0.45 (measured with s2dnet), and unrelated texels would cost about 0.7."""
 
-_MEDIAN_SIZE = (
-    13  # pixels of the working resolution along the side of the window whose median is around one (chosen)
-)
+_MEDIAN_SIZE = 13  # pixels of the working resolution along the side of the median's window (chosen)
 _CONTRAST = 3.0  # factor of the contrast, relative to that of the other channels (chosen)
 _LEAST_PIXELS = 16  # in the mask, for a principal component analysis to mean anything
 

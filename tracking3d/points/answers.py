@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 class PointAnswers:
     """N points in one frame, by that frame and those before it."""
 
-    # (N, 2) pixels of the frame; NaN before a point was asked for, beside the object, where the object is
+    # (N, 2) pixels of the frame; NaN before a point was given, in the background, where the object is
     # lost and behind the camera. Points on the object's mask that no surface covers yet are where the images
     # carry them, and their points are NaN.
     positions: NDArray[np.float64]

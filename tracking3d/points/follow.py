@@ -27,12 +27,12 @@ _UNLIKE = 0.2  # likeness below which something else is in front
 class Followed:
     """N points in T views, in pixels of the frames."""
 
-    positions: Array  # (T, N, 2); NaN for points beside the object, and where there is no view
+    positions: Array  # (T, N, 2); NaN for points in the background, and where there is no view
     visible: NDArray[np.bool_]  # (T, N) bool
     # (T, N) pixels within twice which a position is right in some 19 of 20 cases; NaN if there is no position
     uncertainty: Array
     measured: NDArray[np.bool_]  # (T, N) bool: whether the image had a say
-    points: Array  # (N, 3) in object coordinates; NaN for points beside the object
+    points: Array  # (N, 3) in object coordinates; NaN for points in the background
     # (T, N, F) what the uncertainty is estimated from, see `tracking3d.points.uncertainty.error_features`;
     # NaN if there is no position
     features: Array

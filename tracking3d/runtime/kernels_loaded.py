@@ -1,7 +1,7 @@
 """Importing this loads all kernels that are kept on disk.
 
 The process that others are forked from imports it, so that they need not load them each: half a second a process.
-Nothing is compiled here, for nobody knows yet what will be needed.
+Nothing is compiled here, because it is not known yet what will be needed.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class VideoSegmenter:
         scene = self._scene(frame)
         if scene is None or not scene.answer.any():
             return
-        if may_keep and _agreement(scene) > self._least_agreement:
+        if may_keep and _least_iou(scene) > self._least_agreement:
             self.kept.add(frame.index)
         if wanted:
             self._consensus.see(scene)
@@ -212,7 +212,7 @@ class VideoSegmenter:
         return 0.0 if scene is None or not scene.initial.any() else self._agreement.of_frame(scene)
 
 
-def _agreement(scene: FrameWindow) -> float:
+def _least_iou(scene: FrameWindow) -> float:
     """The lower IoU of a frame's mask with the silhouette and with the initial mask, where there is one."""
     others = [scene.drawn & scene.valid, *([scene.initial] if scene.initial.any() else [])]
     return min(

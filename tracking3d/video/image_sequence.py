@@ -70,7 +70,7 @@ class ImageSequence:
     selection: range
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
-    # images per second of all files, selected or not, which their times are counted by; None if nobody knows
+    # images per second of all files, selected or not, which their times are counted by; None if not given
     rate: float | None = None
     repeatable: bool = True
     notes: tuple[str, ...] = ()

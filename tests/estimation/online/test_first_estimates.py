@@ -75,6 +75,7 @@ def test_frames_after_those_of_the_start_become_keyframes_and_their_points_landm
     assert indices[-1] > FRAMES - 4
     assert estimates[-1].diagnostics["inliers"] > 10
     assert largest_error(estimates) < 25
+    assert state.feature_space.contrast == 0  # with points the features are the encoder's alone
 
 
 def test_frames_before_those_of_the_start_are_estimated_backwards_in_time(monkeypatch):
@@ -106,7 +107,7 @@ def test_without_them_the_last_frame_shows_hardly_a_landmark(monkeypatch):
     assert estimates[-1].diagnostics["inliers"] < 5
 
 
-def test_earlier_frames_get_the_poses_of_a_map_that_is_begun_again(monkeypatch):
+def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted(monkeypatch):
     again = 16
 
     def without_points(*given, **options) -> tuple[SolverState, InitialMap | None]:
@@ -115,12 +116,12 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_begun_again(monkeypatch):
             return state, None
         return state, replace(start, object_map=replace(start.object_map, pointless=True))
 
-    def begun_again(state: SolverState, config: OnlineConfig) -> SolverState:
+    def restarted(state: SolverState, config: OnlineConfig) -> SolverState:
         if state.last_pose[1] + 1 != again:
             return state
-        assert state.repeatable
+        assert state.revisable
         other = [replace(view, pose=exact(view.index, state)) for view in state.object_map.keyframes]
-        return replace(state, object_map=replace(state.object_map, keyframes=tuple(other)), repeatable=())
+        return replace(state, object_map=replace(state.object_map, keyframes=tuple(other)), revisable=())
 
     def exact(index: int, state: SolverState) -> Pose:
         R = clip().T_cam_obj[index, :3, :3] @ clip().T_cam_obj[0, :3, :3].T
@@ -128,7 +129,7 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_begun_again(monkeypatch):
         return pose_from_arrays(R, own.translation.numpy(), state.object_map.vertices)
 
     monkeypatch.setattr(map_initialization, "try_initialize", without_points)
-    monkeypatch.setattr(map_initialization, "restart_if_misfit", begun_again)
+    monkeypatch.setattr(map_initialization, "restart_if_misfit", restarted)
     frames = [Frame(index, image) for index, image in enumerate(clip().images[: again + 2])]
     state, _ = small_solver().init(frames[0], estimate_of(clip().masks[0]))
     answers = []
@@ -138,5 +139,9 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_begun_again(monkeypatch):
     at_once, *later = answers[again - 1 :]
     assert [one.index for one in at_once.revised] == list(range(again))
     assert all(not one.revised for one in later)
-    assert state.repeatable == ()
+    assert state.revisable == ()
+    # Without points all keyframes have the contrast among their features, also those that came after the start.
+    assert state.feature_space.contrast > 0
+    assert {len(view.observation.features) for view in state.object_map.keyframes} == {4}
+    assert state.surface.texture.shape[0] == 4
     assert largest_error(final(answers[again - 1 : again])) < 10

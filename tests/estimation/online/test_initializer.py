@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from patterns import disc, moved, shift, speckle, warped
 from solid_points import map_with_points
 from turned_solid import CAMERA, SIZE, turned, turned_map
 
 from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow
 from tracking3d.estimation.online.initialization import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -285,6 +287,22 @@ def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked
     _, start = try_initialize(replace(given, pending=tuple(plain)), CONFIG)
     assert start is not None and start.origin == "turning"
     assert not asked["points"]
+
+
+def test_a_start_without_points_sees_the_contrast_of_small_marks(monkeypatch):
+    given = belief_of(list(np.linspace(0, 60, 13)))
+    plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)
+    channels = len(plain[0][0].observation.features)
+    space = FeatureSpace(torch.zeros(channels), torch.eye(channels))
+    seen = []
+
+    def start(object_map, camera, views, weights):
+        seen.extend(len(view.observation.features) for view in views)
+        return [InitialMap(object_map, 0.1, 0.0, "turning", camera)]
+
+    monkeypatch.setattr(initializer, "initialize_without_points", start)
+    try_initialize(replace(given, pending=plain, feature_space=space), CONFIG)
+    assert set(seen) == {channels + 1}
 
 
 def test_a_map_without_points_that_misses_its_masks_is_not_accepted(asked, monkeypatch):

@@ -79,8 +79,8 @@ class FrameMapping(ContinuedRefinement):
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated
         estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
-        if state.repeatable:
-            updated = replace(updated, repeatable=thin_out((*state.repeatable, (found.view, plain))))
+        if state.revisable:
+            updated = replace(updated, revisable=thin_out((*state.revisable, (found.view, plain))))
         if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         if not (found.lost or is_keyframe):

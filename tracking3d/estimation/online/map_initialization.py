@@ -32,7 +32,7 @@ from tracking3d.runtime.stage_times import in_stage
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
-_BEGUN_AGAIN = "begun again"  # what the first poses come from, see `FrameEstimate.hypothesis`
+_RESTARTED = "restarted"  # what the first poses come from, see `FrameEstimate.hypothesis`
 _IN_PROGRESS = "the first map is being computed"
 Pending = tuple[Keyframe, FrameEstimate]
 """A frame that waits for the first map, and its estimate so far."""
@@ -103,7 +103,7 @@ class MapInitialization(MapExtension):
                 surface=object_map.surface(),
                 pending=None,
                 rested=(),
-                repeatable=waiting if start.object_map.pointless and not self.in_background else (),
+                revisable=waiting if start.object_map.pointless and not self.in_background else (),
             )
             updated = refine_by_landmarks(updated, self.online)
             if self.config.has_given_masks:
@@ -116,8 +116,8 @@ class MapInitialization(MapExtension):
             estimate = replace(estimate, reason=_LOOKS_FLAT)
         return updated, estimate
 
-    def _begin_again(self, state: SolverState) -> tuple[SolverState, tuple[FrameEstimate, ...]]:
-        """The state before the next frame, and new estimates of earlier ones if its map is begun again.
+    def _restart_if_misfit(self, state: SolverState) -> tuple[SolverState, tuple[FrameEstimate, ...]]:
+        """The state before the next frame, and new estimates of earlier ones if its map is restarted.
 
         See `restart_if_misfit`. A live source would wait for seconds, so there it stays.
         """
@@ -125,10 +125,10 @@ class MapInitialization(MapExtension):
             return state, ()
         with in_stage("map"):
             updated = restart_if_misfit(state, self.online)
-            if updated.object_map is state.object_map or not state.repeatable:
+            if updated.object_map is state.object_map or not state.revisable:
                 return updated, ()
             updated, revised = estimate_pending_frames(
-                updated, state.repeatable, _BEGUN_AGAIN, state.camera, self.online, self.weights
+                updated, state.revisable, _RESTARTED, state.camera, self.online, self.weights
             )
         return updated, tuple(revised)
 

@@ -147,7 +147,7 @@ class OnlineSolver(MapInitialization):
         frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
-        state, revised = self._begin_again(state)
+        state, revised = self._restart_if_misfit(state)
         state, estimate = self._track(state, frame, image, binary)
         if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)

@@ -198,7 +198,7 @@ def _with_active_map(
         trajectory=((newest.pose, newest.index),),
         object_map=other.object_map,
         surface=other.surface,
-        repeatable=(),
+        revisable=(),
         baseline=other.baseline,
         mask_agreement=other.mask_agreement,
         unaligned=other.unaligned,

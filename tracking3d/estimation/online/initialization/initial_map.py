@@ -48,10 +48,8 @@ _FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
 _VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted to the end (measured)
 _STAGES = ((8, True), (5, False))  # evaluations of the survivors, and whether at half resolution
 _LAST_EVALUATIONS = 5  # of the best one
-_VIEWS_AGAIN = 12  # keyframes from which a map is begun again (chosen)
-_CLEARLY_BETTER = (
-    0.95  # share of the costs of the present map and of the best rival that turns otherwise (chosen)
-)
+_VIEWS_AGAIN = 12  # keyframes from which a map is restarted (chosen)
+_CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best other rotation (chosen)
 _SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
 _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
@@ -179,7 +177,7 @@ def initialize_without_points(
 
 
 def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> ObjectMap:
-    """A map without points from the same keyframes, begun again with other rotations, if it explains them better.
+    """A map without points from the same keyframes, restarted with other rotations, if it explains them better.
 
     More views tell hypotheses apart that the first views do not. The present rotations compete, the reversed ones, and
     those near both; the shape begins as the prototype. At most `_VIEWS_AGAIN` keyframes stay.

@@ -249,7 +249,7 @@ def _refuse(state: SolverState, views: list[Keyframe]) -> SolverState:
 
 
 def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
-    """The state before the next frame, its map begun again if that has explained the last frames badly for long.
+    """The state before the next frame, its map restarted if that has explained the last frames badly for long.
 
     It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
     """
@@ -257,8 +257,8 @@ def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
     if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
         return state
     restarts = state.restarts + 1
-    again = state.repeatable if restarts < _MOST_RESTARTS else ()
-    state = replace(state, misfits=0, restarts=restarts, repeatable=again)
+    again = state.revisable if restarts < _MOST_RESTARTS else ()
+    state = replace(state, misfits=0, restarts=restarts, revisable=again)
     weights = FitWeights(smoothness=config.smoothness)
     object_map = restart_without_points(state.object_map, state.camera, weights)
     if object_map is state.object_map:

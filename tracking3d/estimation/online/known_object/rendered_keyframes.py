@@ -54,7 +54,7 @@ class RenderedSide:
     image: NDArray[np.uint8]  # (S, S, 3) uint8
     mask: NDArray[np.bool_]  # (S, S) its silhouette; known: where its colours are known
     known: NDArray[np.bool_]
-    # (S, S, 3) surface points in object coordinates, at the pixels' centres; nan beside the object
+    # (S, S, 3) surface points in object coordinates, at the pixels' centres; NaN in the background
     points: NDArray[np.float32]
 
 

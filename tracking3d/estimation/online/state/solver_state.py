@@ -87,7 +87,7 @@ class SolverState:
     lost_frames: int = 0
     doubtful_frames: int = 0  # how many frames in a row have been lost or of low confidence
     misfits: int = 0  # how many frames in a row a map without points has explained worse than its first ones
-    restarts: int = 0  # how often it was begun again for that
+    restarts: int = 0  # how often the map was restarted for that
     # the best pose of the last frame, if that had a mask and the pose was rejected
     last_candidate: Pose | None = None
     # poses and indices of the last tracked frames, for the motion model
@@ -110,9 +110,9 @@ class SolverState:
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     # frames before the pending ones, in which the object did not turn yet; the first map gives them a pose
     rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
-    # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is begun again, they are
-    # estimated again. Empty if it cannot be.
-    repeatable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is restarted, they are
+    # estimated anew. Empty if it cannot be restarted.
+    revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     # the initialization that is computed in another thread, if there is one; see
     # `tracking3d.estimation.online.map_initialization`
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
