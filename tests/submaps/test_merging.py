@@ -21,7 +21,11 @@ from tracking3d.frames import Prompt
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.components import build_encoder
-from tracking3d.submaps import merging
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask, write_mask
+from tracking3d.results.initial_masks import write_initial_mask
+from tracking3d.results.visible_masks import write_visible_masks
+from tracking3d.submaps import merged_run, merging
 from tracking3d.submaps.alignment import (
     DisagreementError,
     align_submaps,
@@ -155,6 +159,36 @@ def test_features_are_those_of_the_first_part_s_space(solved):
         error = (again.observation.features[:, inside] - truth).abs().mean()
         assert error < 0.2 * (moved_view.observation.features[:, inside] - truth).abs().mean()
         assert error < 0.06
+
+
+def test_a_map_with_the_contrast_and_one_without_get_the_features_of_the_other_s_space(solved):
+    state = solved[0]
+    space, encoder = state.feature_space, build_encoder(settings())
+    plain = in_space(state.object_map, space, space.with_contrast(), encoder)
+    back = in_space(plain, space.with_contrast(), space, encoder)
+    for view, marked, same in zip(back.keyframes, plain.keyframes, state.object_map.keyframes, strict=True):
+        seen = same.observation
+        torch.testing.assert_close(view.observation.features, seen.features, atol=1e-4, rtol=0)
+        expected = space.with_contrast().add_contrast(seen.features, seen.image)
+        torch.testing.assert_close(marked.observation.features, expected, atol=1e-4, rtol=0)
+
+
+def test_what_is_seen_of_the_object_is_written_at_the_end_of_a_split_run_too(tmp_path):
+    part, run = tmp_path / "part", tmp_path / "run"
+    for folder in (
+        part / layout.MASKS,
+        part / layout.INITIAL_MASKS,
+        run / layout.MASKS,
+        run / layout.INITIAL_MASKS,
+    ):
+        folder.mkdir(parents=True)
+    hand = np.zeros((8, 8), bool)
+    hand[:4] = True
+    write_initial_mask(part, 0, ~hand, hand)
+    write_mask(layout.mask_path(part, 0), np.ones((8, 8), bool))
+    merged_run._copy_masks(part, run, [0])
+    write_visible_masks(run)
+    np.testing.assert_array_equal(read_mask(layout.visible_mask_path(run, 0)), ~hand)
 
 
 def test_beliefs_are_joined_into_one_that_explains_both(solved):

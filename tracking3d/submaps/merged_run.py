@@ -132,8 +132,9 @@ def _transform_records(records: Sequence[FrameRecord], similarity: Similarity) -
 
 def _copy_masks(source: Path, target: Path, indices: Sequence[int]) -> None:
     with writing(target):
-        if (source / layout.PROBABILITIES).is_dir():
-            (target / layout.PROBABILITIES).mkdir(exist_ok=True)
+        for kind in (layout.PROBABILITIES, layout.VISIBLE_MASKS):  # the latter are written at the end
+            if (source / kind).is_dir():
+                (target / kind).mkdir(exist_ok=True)
         for path_of in (layout.mask_path, layout.initial_mask_path, layout.probability_path):
             for index in indices:
                 with suppress(
