@@ -45,9 +45,8 @@ EXACT = {
 AT_LEAST = {
     "tracking3d.config.loading": "config_schema layers_in_words list_presets list_qualities load_config load_prompt",
     "tracking3d.config.models": """CameraConfig ObjectConfig PipelineConfig PluginChoice RuntimeConfig
-        SolverConfig CropConfig""",
-    "tracking3d.config.solvers": """KeyframeConfig LearningRates OnlineConfig PaperConfig SolverConfig
-        TrackingWeights LossWeights""",
+        SolverConfig CropConfig KeyframeConfig LearningRates OnlineConfig PaperConfig TrackingWeights
+        LossWeights""",
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",
@@ -70,7 +69,7 @@ AT_LEAST = {
     "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
     "tracking3d.video.in_memory": "open_frames",
     "tracking3d.pipeline.track": "Session track track_objects",
-    "tracking3d.points.answers": "PointAnswers",
+    "tracking3d.points.online": "PointAnswers",
     "tracking3d.networks.download": "adopt fetch",
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",

@@ -6,7 +6,7 @@ import gc
 
 import pytest
 
-from tracking3d.runtime.garbage_collection import collection_deferred
+from tracking3d.runtime.memory import collection_deferred
 
 
 @pytest.fixture(autouse=True)

@@ -3,8 +3,8 @@
 ``python training/hindsight_masks.py FOLDER --runs BENCHMARK ...`` reads the runs that ``tracking3d evaluate suite`` has
 left in ``BENCHMARK/runs`` (of any masks: trackers' ones say how they err, exact ones that they are to be kept), goes
 over their frames as the final refinement does, asks at pixels near the outlines, and some elsewhere, what the sources
-of `tracking3d.segmentation.whole_video_features` say and whether the object is there, fits a logistic regression
-without a constant, and writes ``tracking3d/segmentation/whole_video_weights.py``. ``FOLDER`` holds the sequences. Runs
+of `tracking3d.segmentation.whole_video` say and whether the object is there, fits a logistic regression
+without a constant, and writes ``tracking3d/segmentation/whole_video.py``. ``FOLDER`` holds the sequences. Runs
 with exact masks count as much as all others together.
 """
 
@@ -28,8 +28,7 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.segmentation.frame_window import Answered
 from tracking3d.segmentation.temporal_neighbours import REACH
-from tracking3d.segmentation.whole_video import VideoSegmenter
-from tracking3d.segmentation.whole_video_features import PixelEvidence
+from tracking3d.segmentation.whole_video import PixelEvidence, VideoSegmenter
 from tracking3d.trackers.crops import crop_window
 
 PIXELS = 400

@@ -4,7 +4,7 @@
 
     python training/image_point_uncertainty.py
 
-The weights that it prints belong into ``tracking3d/points/image_uncertainty.py``. They are fitted on points of turning
+The weights that it prints belong into ``tracking3d/points/image_following.py``. They are fitted on points of turning
 objects, whose appearance changes; of what lies still before a moving camera the error is then told too large rather
 than too small. Both are tested. Quantile regression, as in ``training/point_uncertainty.py``.
 """
@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from point_uncertainty import fit
 
-from tracking3d.points.image_following import follow_in_images
-from tracking3d.points.image_uncertainty import image_error_features
+from tracking3d.points.image_following import follow_in_images, image_error_features
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.synthesis.procedural_texture import paint_background

@@ -35,7 +35,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tracking3d.estimation.observation import mask_distance
-from tracking3d.estimation.paper.losses import erode
+from tracking3d.estimation.paper.problem import erode
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle, rotation_exponential
 from tracking3d.rendering import sample_texture
 from tracking3d.rendering.renderer import project, to_camera

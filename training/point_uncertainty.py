@@ -6,7 +6,7 @@
     tracking3d evaluate suite fresh --seed 401 --masks truth --out OTHER     # to test
     python training/point_uncertainty.py OUT OTHER
 
-The weights that it prints belong into ``tracking3d/points/uncertainty.py``. Quantile regression (Koenker and Bassett,
+The weights that it prints belong into ``tracking3d/points/follow.py``. Quantile regression (Koenker and Bassett,
 "Regression quantiles", 1978) of the logarithm of the error, in pixels of the frame: what is fitted is the quantile of
 0.95, half of which is the uncertainty.
 """

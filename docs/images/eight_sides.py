@@ -23,8 +23,8 @@ from tracking3d.frames import Image
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction.rebuild import EXTENDS
 from tracking3d.results import layout
+from tracking3d.results.contact_sheet import render_view
 from tracking3d.results.mesh_export import load_model
-from tracking3d.results.mesh_view import render_view
 from tracking3d.results.run_reader import RunReader
 from tracking3d_bench.datasets.clip import read_truth
 from tracking3d_bench.datasets.run_answers import answers_of_run

@@ -18,12 +18,11 @@ from PIL import Image as PillowImage
 
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Frame, Image
+from tracking3d.results.contact_sheet import render_view
 from tracking3d.results.drawing import REFINED, draw_outline
 from tracking3d.results.mesh_export import load_model
-from tracking3d.results.mesh_view import render_view
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader
-from tracking3d.results.run_source import open_run_source
+from tracking3d.results.run_reader import RunReader, open_run_source
 
 MARGIN = 1.2
 """Side of the crop, relative to the object's."""

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, Image
+from tracking3d.results.contact_sheet import render_view
 from tracking3d.results.layout import OVERLAY
 from tracking3d.results.mesh_export import load_model
-from tracking3d.results.mesh_view import render_view
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 

@@ -13,7 +13,7 @@ from small_videos import BOX, write_video
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.running import run_batch
 from tracking3d.config.loading import load_config
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d.errors import OutputError
 
 

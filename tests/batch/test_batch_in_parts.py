@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.batch import submap_tasks, tasks
+from tracking3d.batch import tasks
 from tracking3d.batch.folder import read_failures, read_result_rows
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.running import run_batch
 from tracking3d.batch.tasks import Tasks
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.loading import load_config
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.engines.protocol import Fault
 from tracking3d.errors import OutputError
 from tracking3d.submaps.job import SplitResult
-from tracking3d.submaps.steps import Step
+from tracking3d.submaps.split_run import Step
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def cut(monkeypatch, finished_run):
         yield [Step(end, folders, "its end")]
         return SplitResult(tuple(folders), 2, *refused)
 
-    monkeypatch.setattr(submap_tasks, "begin", begin)
+    monkeypatch.setattr(tasks, "begin", begin)
     monkeypatch.setattr(tasks, "steps_of", steps_of)
     return done, faults, refused
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from tracking3d.batch.networks import keep_networks, share_networks
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d.networks.catalogue import known_networks
 from tracking3d.networks.store import VARIABLE, network_path
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from browser import open_page
 
-from tracking3d.batch import overview
+from tracking3d.batch import running
 from tracking3d.batch.folder import BatchProgress, Failure
-from tracking3d.batch.overview import write_overview
+from tracking3d.batch.running import write_overview
 from tracking3d.batch.summary import COLUMNS
 
 
@@ -35,7 +35,7 @@ def test_names_and_reasons_are_text_whatever_is_in_them(tmp_path):
 
 
 def test_of_very_many_runs_the_most_doubtful_have_pictures(tmp_path, monkeypatch):
-    monkeypatch.setattr(overview, "MOST_PICTURES", 2)
+    monkeypatch.setattr(running, "MOST_PICTURES", 2)
     pictures = {"day/a": "QUFB", "day/b": "QkJC", "night/c": "Q0ND"}
     page = written(tmp_path, pictures=pictures)
     assert ["QUFB" in page, "QkJC" in page, "Q0ND" in page] == [True, False, True]

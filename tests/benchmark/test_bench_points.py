@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error
+from tracking3d.points.follow import FEATURES, Evidence, expected_error
 from tracking3d_bench.benchmark.point_methods import chained_dense_flow, chained_lucas_kanade
 from tracking3d_bench.benchmark.point_runs import (
     LONG,

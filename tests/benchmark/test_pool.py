@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d_bench.benchmark import job as job_module
 from tracking3d_bench.benchmark import pool
 from tracking3d_bench.benchmark.fingerprint import hashed_sources

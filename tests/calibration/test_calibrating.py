@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from seen_boards import HEIGHT, WIDTH, lens, view
 
-from tracking3d.calibration.boards import Board, parse_squares
-from tracking3d.calibration.calibrate import BoardView, calibrate, coverage, spread_views
+from tracking3d.calibration.calibrate import (
+    Board,
+    BoardView,
+    calibrate,
+    coverage,
+    parse_squares,
+    spread_views,
+)
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.lens import Lens

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d.engines.protocol import Needs
 from tracking3d.video import VideoWriter
 

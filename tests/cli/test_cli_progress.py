@@ -9,9 +9,7 @@ import pytest
 from rich.console import Console
 
 from tracking3d.cli import progress as module
-from tracking3d.cli.plans import plan_run
-from tracking3d.cli.progress import show_progress
-from tracking3d.cli.remaining_time import PlannedStage, RemainingTime, estimate_in_words
+from tracking3d.cli.progress import PlannedStage, RemainingTime, estimate_in_words, plan_run, show_progress
 from tracking3d.config.loading import load_config
 from tracking3d.frames import SkippedFrame
 from tracking3d.runtime.progress import StageProgress, listen_to_progress, report_each, report_progress

@@ -16,8 +16,8 @@ from tracking3d.cli import run as run_module
 from tracking3d.cli import view as view_module
 from tracking3d.cli.tracking import RunRequest
 from tracking3d.config.loading import load_config
+from tracking3d.picker.correction import read_outcome, save_outcome
 from tracking3d.picker.drawing import DrawnObject
-from tracking3d.picker.outcome import read_outcome, save_outcome
 from tracking3d.picker.session import Picked
 from tracking3d.pipeline.record import RecordOptions
 from tracking3d.prompts.prompt import PromptSet
@@ -284,8 +284,7 @@ def test_the_options_of_the_command_line_are_chosen_on_the_page_and_can_be_chang
 
 def test_a_camera_file_of_the_command_line_stays_unless_the_page_names_another_lens(clip, tmp_path):
     from tracking3d.cli.options import SettingsOptions
-    from tracking3d.cli.options.camera import CameraOptions
-    from tracking3d.cli.options.tracking import TrackingOptions
+    from tracking3d.cli.options.tracking import CameraOptions, TrackingOptions
 
     file = tmp_path / "cameras.txt"
     file.write_text("1 PINHOLE 64 48 60 60 31.5 23.5\n")
@@ -301,8 +300,7 @@ def test_a_camera_file_of_the_command_line_stays_unless_the_page_names_another_l
 
 def test_the_page_of_the_tracker_auto_shows_the_masks_of_the_one_that_it_stands_for(clip):
     from tracking3d.cli.options import SettingsOptions
-    from tracking3d.cli.options.camera import CameraOptions
-    from tracking3d.cli.options.tracking import TrackingOptions
+    from tracking3d.cli.options.tracking import CameraOptions, TrackingOptions
 
     tracking = TrackingOptions(tracker="auto")
     menu = pick_module.settings_menu(

@@ -19,8 +19,8 @@ from recorded_runs import HEIGHT, WIDTH, write_run
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
+from tracking3d.geometry.alignment import is_rigid
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.rigid import is_rigid
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import write_clip

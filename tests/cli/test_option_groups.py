@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
-from tracking3d.cli.options import Quiet, grouped, panels
+from tracking3d.cli.options import Quiet, general, grouped
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ def commands(command, path: str = "tracking3d"):
 
 
 SHARED = {
-    **dict.fromkeys(("--config", "--preset", "--quality", "--model", "--set"), panels.SETTINGS),
-    **dict.fromkeys(("--fov", "--intrinsics"), panels.CAMERA),
-    "--out": panels.OUTPUT,
-    "--frames": panels.VIDEO,
-    "--jobs": panels.PERFORMANCE,
-    "--workers": panels.PERFORMANCE,
+    **dict.fromkeys(("--config", "--preset", "--quality", "--model", "--set"), general.SETTINGS),
+    **dict.fromkeys(("--fov", "--intrinsics"), general.CAMERA),
+    "--out": general.OUTPUT,
+    "--frames": general.VIDEO,
+    "--jobs": general.PERFORMANCE,
+    "--workers": general.PERFORMANCE,
 }
 
 

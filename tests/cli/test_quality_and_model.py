@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.config.choices import MODELS, QUALITIES
+from tracking3d.config.loading import MODELS, QUALITIES
 
 BOX = ("--box", "20,10,20,20")
 WITH_MODEL = {

@@ -6,9 +6,8 @@ import pytest
 from recorded_runs import write_run
 
 from tracking3d.errors import InputError, PluginError
-from tracking3d.export.exporting import find_format
+from tracking3d.export.exporting import OTHER_NAMES, find_format
 from tracking3d.export.formats import FORMATS
-from tracking3d.export.other_names import OTHER_NAMES
 from tracking3d.plugins import FEATURES, TRACKERS, plugin_label
 
 BOX = ("--box", "20,10,20,20")

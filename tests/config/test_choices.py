@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.config.choices import MODELS, QUALITIES, check_model, check_quality, set_model
-from tracking3d.config.loading import load_config
+from tracking3d.config.loading import MODELS, QUALITIES, check_model, check_quality, load_config, set_model
 from tracking3d.errors import InputError
 
 

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from tracking3d.config.loading import config_schema, list_presets, load_config, ready_files
-from tracking3d.config.models import PipelineConfig
-from tracking3d.config.solvers import OnlineConfig, PaperConfig
-from tracking3d.config.yaml_files import parse_yaml
+from tracking3d.config.loading import config_schema, list_presets, load_config, parse_yaml, ready_files
+from tracking3d.config.models import OnlineConfig, PaperConfig, PipelineConfig
 from tracking3d.errors import InputError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess
 from tracking3d.engines.processes import ProcessEngine
 
 

@@ -9,8 +9,7 @@ import time
 import engine_tasks as tasks
 import pytest
 
-from tracking3d.engines.choosing import open_engine
-from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.choosing import InThisProcess, open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine, default_workers
 from tracking3d.engines.protocol import Began, Ended, Fault, Needs, Task, Told

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tracking3d.config.solvers import PaperConfig
+from tracking3d.config.models import PaperConfig
 from tracking3d.estimation.observation import Observation, ObservationBatch, mask_distance
 from tracking3d.estimation.paper.problem import Parameters, Problem
 from tracking3d.estimation.shape import Shape

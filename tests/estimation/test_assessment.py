@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.estimation.assessment import Assessment, assess
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import Assessment, Status, assess
 
 
 def judged(

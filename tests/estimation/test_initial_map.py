@@ -12,7 +12,7 @@ import trimesh
 
 from tracking3d.config.models import ObjectConfig
 from tracking3d.errors import InputError
-from tracking3d.estimation.prototype_start import RADIUS, first_translation, mask_ellipse, prototype_mesh
+from tracking3d.estimation.shape import RADIUS, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.mesh import Mesh
 from tracking3d.rendering import project, rasterize

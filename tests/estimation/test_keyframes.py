@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tracking3d.config.solvers import KeyframeConfig
-from tracking3d.estimation.paper.keyframes import KeyframeCandidate, select_keyframes, thin_out
+from tracking3d.config.models import KeyframeConfig
+from tracking3d.estimation.paper.solver import KeyframeCandidate, select_keyframes, thin_out
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 TAU = 0.2

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tracking3d.estimation.paper.losses import (
+from tracking3d.estimation.paper.problem import (
     appearance_loss,
     distance_loss,
     erode,

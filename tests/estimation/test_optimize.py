@@ -9,8 +9,7 @@ import pytest
 import torch
 from small_scenes import observed, painted, parameters_of, pose_of, problem_of
 
-from tracking3d.estimation.paper.optimize import Optimum, optimize
-from tracking3d.estimation.paper.problem import Losses, Problem
+from tracking3d.estimation.paper.problem import Losses, Optimum, Problem, optimize
 from tracking3d.geometry.pose import rotation_angle
 
 SLOW = {"translation": 0.01, "rotation": 0.01, "vertices": 0.005, "texture": 0.02}

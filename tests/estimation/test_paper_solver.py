@@ -13,8 +13,7 @@ import trimesh
 from short_runs import estimate_of, frame, known_run, quick_solver, revised, run, short_clip, true_mask
 
 from tracking3d.config.loading import load_config
-from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
+from tracking3d.estimation.estimate import Assessment, FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.paper.problem import Losses
 from tracking3d.estimation.paper.solver import PaperSolver

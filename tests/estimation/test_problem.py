@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_scenes import observed, parameters_of, pose_of, problem_of
 
-from tracking3d.config.solvers import LossWeights, PaperConfig
+from tracking3d.config.models import LossWeights, PaperConfig
 from tracking3d.estimation.paper.problem import Losses, Parameters
 from tracking3d.estimation.shape import flatten
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from tracking3d.config.models import ObjectConfig
-from tracking3d.estimation.prototype_start import RADIUS, mask_ellipse, place_on_mask, prototype_mesh
-from tracking3d.estimation.shape import Shape, unfold
+from tracking3d.estimation.shape import RADIUS, Shape, mask_ellipse, place_on_mask, prototype_mesh, unfold
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.rendering import project, rasterize

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tracking3d.estimation.appearance import visible_texture
+from tracking3d.estimation.shape import visible_texture
 from tracking3d.rendering import BackProjection
 
 

@@ -12,8 +12,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.prompts.prompt import read_mask_file
 from tracking3d.results.run_reader import RunReader
-from tracking3d.trackers.coco_masks import CocoMasks, decompress
-from tracking3d.trackers.mask_files import open_masks
+from tracking3d.trackers.mask_files import CocoMasks, decompress, open_masks
 from tracking3d.trackers.mask_images import objects_in
 from tracking3d.trackers.precomputed import PrecomputedMasks
 

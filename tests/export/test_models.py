@@ -14,10 +14,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.mesh_export import export_mesh, find_seen_faces, load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import longest_side
-from tracking3d.results.unseen_surface import find_seen_faces
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 VALIDATE = """

@@ -11,12 +11,12 @@ from torch.nn import functional
 
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
-from tracking3d.features.onnx.description import (
+from tracking3d.features.onnx.encoder import (
     EncoderDescription,
+    OnnxEncoder,
     builtin_encoder_descriptions,
     load_encoder_description,
 )
-from tracking3d.features.onnx.encoder import OnnxEncoder
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.networks.session import Network
 from tracking3d.plugins import FEATURES, build_plugin

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from tracking3d import Frame, Prompt, Session, Status, track, track_objects
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import RELOCALIZED
 from tracking3d.estimation.online.known_object import rendered_keyframes
 from tracking3d.estimation.online.known_object.solver import NOT_SEEN
-from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.pipeline.known_object import read_known_object
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d_bench.evaluation.metrics import mask_iou

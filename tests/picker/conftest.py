@@ -16,7 +16,7 @@ from tracking3d.cli.options import configure as configured
 from tracking3d.config.loading import load_config
 from tracking3d.frames import MaskEstimate
 from tracking3d.picker import session as session_module
-from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
+from tracking3d.picker.correction import command_of, save_outcome, settings_as_yaml
 from tracking3d.picker.server import Picker
 from tracking3d.picker.session import PickingSession
 from tracking3d.picker.settings import ChosenSettings, SettingsMenu

@@ -9,7 +9,7 @@ from raw_requests import request, status
 from test_picker_in_browser import drag
 from test_picker_server import BOX, body, post, whole
 
-from tracking3d.config.choices import MODELS, QUALITIES
+from tracking3d.config.loading import MODELS, QUALITIES
 from tracking3d.plugins import FEATURES, TRACKERS, list_plugins
 
 

@@ -15,7 +15,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import MaskEstimate
 from tracking3d.plugins import VARIABLE
 from tracking3d.prompts.prompt import make_prompt
-from tracking3d.rendering.kernels import threads as kernels
+from tracking3d.rendering.kernels import compilation as kernels
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 SETTINGS = [

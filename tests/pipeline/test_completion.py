@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import Status
-from tracking3d.pipeline import completion
+from tracking3d.pipeline import record
 from tracking3d.results import layout
-from tracking3d.results.artefacts import PICTURES
+from tracking3d.results.run_writer import PICTURES
 
 VIDEO = SimpleNamespace(name="a video", repeatable=True)
 
@@ -25,13 +25,13 @@ def made(monkeypatch) -> list[Path]:
     poses = [Rotation.from_euler("y", 4 * n, degrees=True).as_matrix() for n in range(12)]
     frames = [SimpleNamespace(T_cam_obj=R, refined=True, status=Status.TRACKED) for R in poses]
     monkeypatch.setattr(
-        completion,
+        record,
         "RunReader",
         lambda folder: SimpleNamespace(
             frames=frames, description=json.loads((folder / layout.RUN).read_text())
         ),
     )
-    monkeypatch.setattr(completion, "make_final_shape", lambda folder, *_: folders.append(folder))
+    monkeypatch.setattr(record, "make_final_shape", lambda folder, *_: folders.append(folder))
     return folders
 
 
@@ -49,5 +49,5 @@ def test_a_shape_that_was_not_made_is_made(tmp_path, made, shape, notes, again):
         (tmp_path / name).write_bytes(b"there")
     (tmp_path / layout.RUN).write_text(json.dumps({"state": "finished", **notes}))
     config = PipelineConfig.model_validate({"object": {"shape": shape}})
-    completion.complete_run(tmp_path, config, VIDEO)
+    record.complete_run(tmp_path, config, VIDEO)
     assert made == ([tmp_path] if again else [])

@@ -9,7 +9,7 @@ import pytest
 from refining_solver import StandInSolver
 
 from tracking3d import load_config
-from tracking3d.checkpoint import milestones
+from tracking3d.checkpoint import folder
 from tracking3d.checkpoint.staging import take_over
 from tracking3d.errors import InputError
 from tracking3d.pipeline import correct
@@ -36,7 +36,7 @@ def clip() -> SyntheticClip:
 
 @pytest.fixture(autouse=True)
 def quick_solver(monkeypatch):
-    monkeypatch.setattr(milestones, "_FIRST_GAP", 1)
+    monkeypatch.setattr(folder, "_FIRST_GAP", 1)
     monkeypatch.setitem(SOLVERS, "online", StandInSolver)
     monkeypatch.setattr(correct, "check_packages", lambda: None)
 

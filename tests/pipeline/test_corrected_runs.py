@@ -13,8 +13,8 @@ from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import Stopped, assert_alike, files_of, settings
 
+from tracking3d.checkpoint import folder, staging
 from tracking3d.checkpoint import folder as checkpoint_folder
-from tracking3d.checkpoint import milestones, staging
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.pipeline.correct import correct_run, object_folders_of
@@ -33,7 +33,7 @@ FRAMES, CORRECTED = 8, 6
 @pytest.fixture(autouse=True)
 def every_frame(monkeypatch, stand_in_solver):
     """Milestones of every frame, and a solver that answers at once."""
-    monkeypatch.setattr(milestones, "_FIRST_GAP", 1)
+    monkeypatch.setattr(folder, "_FIRST_GAP", 1)
 
 
 @pytest.fixture
@@ -245,7 +245,7 @@ def test_two_corrections_at_a_time_are_refused(clip, images, tmp_path):
 def test_milestones_are_few_and_evenly_spread(clip, images, tmp_path):
     run(clip, images, tmp_path / "run", "runtime.rollback_points=3")
     state = tmp_path / "run" / layout.STATE
-    assert [one.taken for one in milestones.milestones_in(state)] == [4, 8]
+    assert [one.taken for one in folder.milestones_in(state)] == [4, 8]
     run(clip, images, tmp_path / "none", "runtime.rollback_points=0")
     assert not (tmp_path / "none" / layout.STATE).exists()
 
@@ -253,7 +253,7 @@ def test_milestones_are_few_and_evenly_spread(clip, images, tmp_path):
 def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
     run(clip, images, tmp_path / "run", "runtime.rollback_points=2")
     state = tmp_path / "run" / layout.STATE
-    kept = milestones.milestones_in(state)
+    kept = folder.milestones_in(state)
     assert 1 <= len(kept) <= 2
     named = {name for one in kept for name in one.arrays}
     assert {path.name for path in state.glob("*.npz")} == named
@@ -283,13 +283,13 @@ def test_no_milestone_stands_between_a_frame_and_what_revised_it(clip, images, t
 
     monkeypatch.setattr(CausalSolver, "step", revising)
     run(clip, images, tmp_path / "run")
-    kept = milestones.milestones_in(tmp_path / "run" / layout.STATE)
+    kept = folder.milestones_in(tmp_path / "run" / layout.STATE)
     assert [one.taken for one in kept] == [1, 2, 6, 7, 8]
 
 
 def test_a_damaged_milestone_is_passed_over(clip, images, tmp_path, stepped):
     run(clip, images, tmp_path / "run")
-    kept = milestones.milestones_in(tmp_path / "run" / layout.STATE)
+    kept = folder.milestones_in(tmp_path / "run" / layout.STATE)
     kept[5].path.write_text("{")
     stepped.clear()
     correct_run(tmp_path / "run", told(clip))

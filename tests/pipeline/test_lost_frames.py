@@ -12,10 +12,9 @@ from resumable_runs import settings
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.pipeline import lost_frames, second_start
-from tracking3d.pipeline.gap_tracker import plan_gaps
+from tracking3d.pipeline import lost_frames
+from tracking3d.pipeline.lost_frames import SecondStart, plan_gaps
 from tracking3d.pipeline.record import record
-from tracking3d.pipeline.second_start import SecondStart
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.files import write_image
@@ -147,7 +146,7 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
     monkeypatch, tmp_path, video, caplog
 ):
     lose(monkeypatch, set(range(4, FRAMES)))
-    monkeypatch.setattr(second_start, "find_start", lambda source, masks: 5)
+    monkeypatch.setattr(lost_frames, "find_start", lambda source, masks: 5)
     monkeypatch.setattr(Session, "adopt", lambda *given: pytest.fail("it explains fewer"))
     monkeypatch.setattr(SecondStart, "is_better", False)
     monkeypatch.setattr(OnlineSolver, "begin_extension", lambda *given: None)
@@ -166,7 +165,7 @@ def test_run_json_says_where_the_refined_model_started_and_why(monkeypatch, tmp_
     first = run(video, tmp_path / "first").description["refinement"]["start"]
     assert first == {"frame": 0, "reason": "tracking began in this frame"}
     lose(monkeypatch, set(range(4, FRAMES)))
-    monkeypatch.setattr(second_start, "find_start", lambda source, masks: 5)
+    monkeypatch.setattr(lost_frames, "find_start", lambda source, masks: 5)
     monkeypatch.setattr(SecondStart, "is_better", True)
     monkeypatch.setattr(OnlineSolver, "begin_extension", lambda *given: None)
     second = run(video, tmp_path / "second")

@@ -9,7 +9,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.plugins.guard import GuardedTracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 from tracking3d.trackers.segment.network import ObjectNetwork
 
 HAND = np.zeros((90, 120), bool)

@@ -11,8 +11,8 @@ from refining_solver import CausalSolver, StandInSolver
 from scipy.spatial.transform import Rotation
 
 from tracking3d import load_config
-from tracking3d.checkpoint import milestones
-from tracking3d.estimation.refined_start import RefinedStart
+from tracking3d.checkpoint import folder
+from tracking3d.estimation.solver import RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.correct import correct_run
@@ -61,7 +61,7 @@ def images(clip, tmp_path) -> Path:
 
 @pytest.fixture(autouse=True)
 def every_frame(monkeypatch):
-    monkeypatch.setattr(milestones, "_FIRST_GAP", 1)
+    monkeypatch.setattr(folder, "_FIRST_GAP", 1)
     monkeypatch.setitem(SOLVERS, "online", ContinuingSolver)
     monkeypatch.setattr(CausalSolver, "faults", {})
     ContinuingSolver.kept.clear()

@@ -11,8 +11,8 @@ import pytest
 from resumable_runs import Stopped, assert_alike, settings, stop_at
 
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.gap import PhotoEstimates
 from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.solver import PhotoEstimates
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
 from tracking3d.results.files import write_image

@@ -27,8 +27,8 @@ from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
-from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_writer import FrameLines
 from tracking3d.trackers.flow import FlowTracker
 from tracking3d.video import open_source
 

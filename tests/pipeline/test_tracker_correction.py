@@ -12,14 +12,7 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
-from tracking3d.estimation.tracker_feedback import (
-    MOTION_RATIO,
-    MOVES,
-    RELOCALIZED,
-    SURE,
-    WORTH_CORRECTING,
-    corrects,
-)
+from tracking3d.estimation.estimate import MOTION_RATIO, MOVES, RELOCALIZED, SURE, WORTH_CORRECTING, corrects
 from tracking3d.frames import MaskEstimate, Prompt
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.plugins import VARIABLE

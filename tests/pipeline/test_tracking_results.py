@@ -22,7 +22,7 @@ from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.reconstruction import rebuild
 from tracking3d.reconstruction.shape import ReconstructedShape
-from tracking3d.rendering.kernels import threads as kernels
+from tracking3d.rendering.kernels import compilation as kernels
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import visible_side

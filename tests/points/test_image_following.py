@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.points.image_following import follow_in_images
-from tracking3d.points.image_uncertainty import expected_image_error
+from tracking3d.points.image_following import expected_image_error, follow_in_images
 from tracking3d.points.pictures import (
     likeness,
     open_picture,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from twins import patch_alignment
 
-from tracking3d.points.alignment import align
+from tracking3d.points.warping import align
 
 SIZE = 64
 

@@ -6,8 +6,8 @@ from twins import surface_under_pixels
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
+from tracking3d.points.landmark_adjustment import move_surface
 from tracking3d.points.ray_intersection import surface_under
-from tracking3d.points.surface import move_surface
 from tracking3d.points.view import open_view, sample
 
 MESH = sphere(8)

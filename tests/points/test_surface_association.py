@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.points.follow import Followed
+from tracking3d.points.follow import FEATURES, Followed
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.surface_association import meetings, merge_image_points
-from tracking3d.points.uncertainty import FEATURES
 from tracking3d.points.view import open_view
 
 MESH = sphere(12)

@@ -18,14 +18,12 @@ from tracking3d.cli import app
 from tracking3d.errors import InputError
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction import extension
-from tracking3d.reconstruction.extension import check_earlier_run, extend_run
+from tracking3d.reconstruction.extension import check_earlier_run, extend_run, fit_points, register_run
 from tracking3d.reconstruction.rebuild import EXTENDS
-from tracking3d.reconstruction.registration import fit_points, register_run
-from tracking3d.reconstruction.surface_keypoints import shows_other_side, surface_keypoints
-from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.reconstruction.run_views import shows_other_side, surface_keypoints
+from tracking3d.results.mesh_export import export_mesh, find_seen_faces, load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import scale_run, unit_scale
-from tracking3d.results.unseen_surface import find_seen_faces
 
 TO_OWN = Similarity(
     Rotation.from_euler("xyz", [40, -70, 20], degrees=True).as_matrix(), 1.7, np.array([0.3, -0.2, 0.5])

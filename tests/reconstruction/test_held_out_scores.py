@@ -10,8 +10,8 @@ from rendered_views import ball, pattern, pose, seen, view
 from test_volume import CAMERA, shape_views
 
 from tracking3d.reconstruction import bake_texture
-from tracking3d.reconstruction import held_out_scores as module
-from tracking3d.reconstruction.held_out_scores import held_out_scores
+from tracking3d.reconstruction import held_out_test as module
+from tracking3d.reconstruction.held_out_test import held_out_scores
 from tracking3d.reconstruction.shape_views import shape_view
 
 pytest.importorskip("skimage", reason="the extra model is not installed")

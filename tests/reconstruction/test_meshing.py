@@ -15,8 +15,8 @@ from packaging.requirements import Requirement
 pytest.importorskip("skimage")
 pytest.importorskip("fast_simplification")
 
-from tracking3d.reconstruction.grid import Grid
 from tracking3d.reconstruction.meshing import (
+    Grid,
     cell_atlas,
     extract_surface,
     is_sound,

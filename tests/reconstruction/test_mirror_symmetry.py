@@ -10,11 +10,11 @@ import trimesh
 from numpy.typing import NDArray
 from rendered_views import CAMERA, pose
 
-from tracking3d.reconstruction.grid import Grid
-from tracking3d.reconstruction.mesh_distance import mesh_distance
+from tracking3d.reconstruction.meshing import Grid
 from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
 from tracking3d.reconstruction.plane_sweep import Guide
+from tracking3d.reconstruction.shape import mesh_distance
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view
 
 SIZE = np.array([1.6, 1.2, 1.0])

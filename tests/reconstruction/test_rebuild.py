@@ -20,13 +20,12 @@ from tracking3d.frames import Frame
 from tracking3d.reconstruction import rebuild
 from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
 from tracking3d.reconstruction.shape import ReconstructedShape
-from tracking3d.report import turntable
+from tracking3d.report import run_report
 from tracking3d.report.run_report import write_report
 from tracking3d.results.description import RunHeader
 from tracking3d.results.files import write_image
-from tracking3d.results.mesh_export import load_model
+from tracking3d.results.mesh_export import find_seen_vertices, load_model
 from tracking3d.results.run_writer import RunWriter
-from tracking3d.results.unseen_surface import find_seen_vertices
 
 YAWS = (0, 15, 30)
 
@@ -123,7 +122,7 @@ def new_shape(monkeypatch) -> None:
     ids=lambda has: " and ".join(has) or "neither",
 )
 def test_what_shows_the_mesh_is_made_again_if_the_run_has_it(tmp_path, monkeypatch, has):
-    monkeypatch.setattr(turntable, "VIEWS", 3)
+    monkeypatch.setattr(run_report, "VIEWS", 3)
     run = written(tmp_path)
     new_shape(monkeypatch)
     if has:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import Assessment, Status
 from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.reconstruction.confidence import judge_with_landmarks, refined_confidence_features

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from rendered_views import FINE, ball, pattern, view
 
-from tracking3d.reconstruction import texture_details
+from tracking3d.reconstruction import texturing
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap
 
@@ -23,7 +23,7 @@ GAINS = [np.ones(3, np.float32)] * len(YAWS)
 def restore_details(model, texture, *rest) -> NDArray[np.float32]:
     """With the colours last, as pictures have them."""
     planes = np.ascontiguousarray(texture.transpose(2, 0, 1))
-    return texture_details.restore_details(model, planes, *rest).transpose(1, 2, 0)
+    return texturing.restore_details(model, planes, *rest).transpose(1, 2, 0)
 
 
 def views(texture: NDArray[np.float32] | None = None) -> list[TextureView]:
@@ -80,6 +80,6 @@ def test_threads_change_nothing(monkeypatch):
     blurred = cv2.GaussianBlur(pattern(), (0, 0), 2.0)
     found = []
     for threads in (1, 2):
-        monkeypatch.setattr(texture_details.cv2, "getNumThreads", lambda threads=threads: threads)
+        monkeypatch.setattr(texturing.cv2, "getNumThreads", lambda threads=threads: threads)
         found.append(restore_details(MODEL, blurred.copy(), TEXELS, views(), GAINS))
     np.testing.assert_array_equal(*found)

@@ -10,13 +10,16 @@ from rendered_views import CAMERA, pattern, pose, seen
 from twins import plane_sweep, visual_hull
 
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.reconstruction.grid import Grid
-from tracking3d.reconstruction.mesh_distance import mesh_distance
+from tracking3d.reconstruction.meshing import Grid
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps, patch_scores
+from tracking3d.reconstruction.shape import (
+    carve_hull,
+    depth_evidence,
+    fuse_depth,
+    mesh_distance,
+    restore_uncovered,
+)
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
-from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
-from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
-from tracking3d.reconstruction.visual_hull import carve_hull
 
 SIDE = 96
 

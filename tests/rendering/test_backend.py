@@ -26,17 +26,17 @@ from tracking3d.rendering import (
 )
 from tracking3d.rendering.backend import use_numba, why_no_numba
 from tracking3d.rendering.backprojection import TexelMap
-from tracking3d.rendering.kernels import threads
+from tracking3d.rendering.kernels import compilation
 
 LOW, HIGH = torch.zeros(1), torch.zeros(1, dtype=torch.float64)
 
 
 @pytest.fixture(autouse=True)
 def settings_restored() -> Iterator[None]:
-    before = torch.get_num_threads(), threads.get_num_threads()
+    before = torch.get_num_threads(), compilation.get_num_threads()
     yield
     torch.set_num_threads(before[0])
-    threads.set_num_threads(before[1])
+    compilation.set_num_threads(before[1])
 
 
 @pytest.fixture
@@ -220,7 +220,7 @@ def test_without_numba_the_record_says_why(without_numba):
 
 def test_the_kernels_get_the_threads_and_torch_keeps_one():
     prepare_backend("auto", "cpu", 3)
-    assert (torch.get_num_threads(), threads.get_num_threads()) == (1, 3)
+    assert (torch.get_num_threads(), compilation.get_num_threads()) == (1, 3)
 
 
 def test_torch_gets_the_threads_where_it_renders():

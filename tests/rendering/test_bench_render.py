@@ -11,7 +11,7 @@ from scenes import Textured, bumpy_sphere
 
 from tracking3d.errors import InputError
 from tracking3d.rendering import SoftBand, render
-from tracking3d.rendering.kernels import threads as kernels
+from tracking3d.rendering.kernels import compilation as kernels
 from tracking3d_bench.speed import benchmark as bench_render
 from tracking3d_bench.speed import timing as bench_timing
 from tracking3d_bench.speed.benchmark import benchmark

@@ -14,7 +14,7 @@ from scenes import bumpy_sphere
 from torch import Tensor
 
 from tracking3d.rendering import SoftBand, channels_last, render, texture_losses
-from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
+from tracking3d.rendering.kernels.compilation import get_num_threads, set_num_threads
 
 SCENE = bumpy_sphere((40, 44), views=7, frequency=6)
 

@@ -17,10 +17,9 @@ from PIL import Image
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.report import model_data, run_report
+from tracking3d.report import run_report
 from tracking3d.report.doubts import doubts_of
-from tracking3d.report.probability_layer import probability_layers
-from tracking3d.report.run_report import write_report
+from tracking3d.report.run_report import probability_layers, write_report
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
 from tracking3d.results.layout import runs_in
@@ -515,11 +514,11 @@ def test_options_in_a_doubt_are_not_broken_over_lines_and_nothing_in_it_is_marku
 
 
 def test_a_large_texture_is_made_small_and_a_small_one_loses_nothing(run_folder, monkeypatch):
-    small = model_data.model_data(model_data.read_model(run_folder))["texture"]
+    small = run_report.model_data(run_report.read_model(run_folder))["texture"]
     assert small.startswith("data:image/png;base64,")
-    monkeypatch.setattr(model_data, "_LARGE", 100)
-    monkeypatch.setattr(model_data, "MOST_TEXTURE", 1500)
-    large = model_data.model_data(model_data.read_model(run_folder))["texture"]
+    monkeypatch.setattr(run_report, "_LARGE", 100)
+    monkeypatch.setattr(run_report, "MOST_TEXTURE", 1500)
+    large = run_report.model_data(run_report.read_model(run_folder))["texture"]
     assert large.startswith("data:image/webp;base64,")
     pictures = [Image.open(io.BytesIO(base64.b64decode(one.partition(",")[2]))) for one in (small, large)]
     assert pictures[0].size == pictures[1].size

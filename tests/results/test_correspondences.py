@@ -19,9 +19,14 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.results.correspondences import PointTracks, surface_under, track_points
+from tracking3d.results.correspondences import (
+    PointTracks,
+    points_to_csv,
+    points_to_json,
+    surface_under,
+    track_points,
+)
 from tracking3d.results.description import RunHeader
-from tracking3d.results.point_files import points_to_csv, points_to_json
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 

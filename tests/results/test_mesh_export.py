@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.geometry.gltf_axes import read_mesh_file
+from tracking3d.geometry.mesh import read_mesh_file
 from tracking3d.geometry.prototypes import from_file
-from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model
-from tracking3d.results.mesh_view import most_different, render_view, side_shown
-from tracking3d.results.unseen_surface import sort_seen_first
+from tracking3d.results.contact_sheet import most_different, render_view, side_shown
+from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model, sort_seen_first
 from tracking3d_bench.datasets.truth import MeshFile
 from tracking3d_bench.synthesis.mesh_files import load_solid
 from tracking3d_bench.synthesis.spec import SequenceSpec

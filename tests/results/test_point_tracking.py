@@ -12,12 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.results import layout
-from tracking3d.results.correspondences import grid_on_object, project_object_points, track_points
-from tracking3d.results.point_files import COLUMNS, points_to_csv
+from tracking3d.results.correspondences import (
+    COLUMNS,
+    grid_on_object,
+    points_to_csv,
+    project_object_points,
+    track_points,
+)
 from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.point_trails import draw_trails, write_trails
-from tracking3d.results.run_reader import RunReader
-from tracking3d.results.run_source import open_run_source
+from tracking3d.results.run_reader import RunReader, open_run_source
 from tracking3d.runtime.progress import StageProgress, listen_to_progress
 from tracking3d.video import open_source
 

@@ -14,8 +14,8 @@ import pytest
 from tracking3d.errors import OutputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout, lock
+from tracking3d.results.description import is_gone, this_process
 from tracking3d.results.files import write_reserved
-from tracking3d.results.process import is_gone, this_process
 from tracking3d.results.run_reader import RunReader
 
 
@@ -65,9 +65,7 @@ def test_what_has_no_room_leaves_the_file_as_it_was(tmp_path, full_disk):
 
 def ended_process() -> dict:
     """What a process told of itself that is gone."""
-    script = (
-        "import json; from tracking3d.results.process import this_process; print(json.dumps(this_process()))"
-    )
+    script = "import json; from tracking3d.results.description import this_process; print(json.dumps(this_process()))"
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     told: dict = json.loads(done.stdout)
     return told

@@ -10,13 +10,15 @@ import pytest
 import trimesh
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.geometry.gltf_axes import read_mesh_file
-from tracking3d.results.mesh_export import export_mesh, glb_file, load_mesh
-from tracking3d.results.unseen_surface import (
+from tracking3d.geometry.mesh import read_mesh_file
+from tracking3d.results.mesh_export import (
     cut_unseen,
+    export_mesh,
     find_seen_faces,
     find_seen_vertices,
+    glb_file,
     group_faces,
+    load_mesh,
     sort_seen_first,
 )
 

@@ -10,7 +10,7 @@ import pytest
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_mask
-from tracking3d.results.initial_masks import is_initial_mask, write_initial_mask
+from tracking3d.results.run_writer import is_initial_mask, write_initial_mask
 from tracking3d.results.visible_masks import read_occluder, write_visible_masks
 
 MASK = np.zeros((20, 30), bool)

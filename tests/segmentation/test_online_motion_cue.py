@@ -10,11 +10,12 @@ from twins import motion_cue
 
 from tracking3d.geometry.camera import Window
 from tracking3d.segmentation.frame_window import surface_in
-from tracking3d.segmentation.online_motion_cue import MotionReference, online_motion_log_odds
-from tracking3d.segmentation.region_growing import (
+from tracking3d.segmentation.online_motion_cue import (
     MOVES,
+    MotionReference,
     grow_region,
     motion_supported_share,
+    online_motion_log_odds,
     unlike_surroundings,
 )
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize

@@ -11,14 +11,18 @@ import trimesh
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.segmentation import whole_video
-from tracking3d.segmentation.edge_alignment import alignment, edge_strength
 from tracking3d.segmentation.frame_window import Answered, FrameWindow
 from tracking3d.segmentation.motion_cue import background_motion, flow_distance, motion_cue, small_grey
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import TemporalNeighbours
-from tracking3d.segmentation.whole_video import VideoSegmenter, segment_all
-from tracking3d.segmentation.whole_video_features import PixelEvidence
-from tracking3d.segmentation.whole_video_weights import WEIGHTS
+from tracking3d.segmentation.whole_video import (
+    WEIGHTS,
+    PixelEvidence,
+    VideoSegmenter,
+    alignment,
+    edge_strength,
+    segment_all,
+)
 from tracking3d.trackers.outline import inside_distance
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)

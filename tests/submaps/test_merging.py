@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d import Frame, Session, load_config
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.atlas.map_merging import match_landmarks, merge, transform_map
+from tracking3d.estimation.online.atlas.atlas import match_landmarks, merge, transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Prompt
@@ -23,19 +23,20 @@ from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.components import build_encoder
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_mask
-from tracking3d.results.initial_masks import write_initial_mask
+from tracking3d.results.run_writer import write_initial_mask
 from tracking3d.results.visible_masks import write_visible_masks
-from tracking3d.submaps import merged_run, merging
+from tracking3d.submaps import merge_step, merged_run
 from tracking3d.submaps.alignment import (
     DisagreementError,
     align_submaps,
     by_lens,
     check_agreement,
     common_poses,
+    fit_similarity,
+    in_space,
+    through_lens,
 )
-from tracking3d.submaps.merging import merge_submap_states
-from tracking3d.submaps.similarity import fit_similarity
-from tracking3d.submaps.state_merging import in_space, through_lens
+from tracking3d.submaps.merge_step import merge_submap_states
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
 TURN = Similarity(Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), 1.7, np.array([0.1, -0.2, 0.15]))
@@ -220,7 +221,7 @@ def test_parts_joined_at_a_wrong_angle_explain_worse_what_they_show(solved, monk
     )
     second = replace(state, object_map=replace(state.object_map, keyframes=later))
     config = settings()
-    monkeypatch.setattr(merging, "MAX_COST_RATIO", 1.1)
+    monkeypatch.setattr(merge_step, "MAX_COST_RATIO", 1.1)
     merge_submap_states([state, second], [Similarity.identity()] * 2, config.solver, build_encoder(config))
     for axis in "xy":
         wrong = Similarity(Rotation.from_euler(axis, 180, degrees=True).as_matrix(), 1.0, np.zeros(3))
@@ -320,11 +321,11 @@ def test_lenses_that_differ_are_named_where_parts_cannot_be_joined(monkeypatch):
     def refuse(*given):
         raise DisagreementError("parts 1 and 2: they tell of two objects")
 
-    monkeypatch.setattr(merging, "_try_alignment", refuse)
-    monkeypatch.setattr(merging, "build_encoder", lambda config: None)
-    monkeypatch.setattr(merging, "_read_submaps", lambda *given: ([], told))
+    monkeypatch.setattr(merge_step, "_try_alignment", refuse)
+    monkeypatch.setattr(merge_step, "build_encoder", lambda config: None)
+    monkeypatch.setattr(merge_step, "_read_submaps", lambda *given: ([], told))
     with pytest.raises(DisagreementError, match=r"two objects; .* 16 to 45 degrees.*--fov"):
-        merging.merge_submaps(None, load_config(), None, Path())
-    monkeypatch.setattr(merging, "_read_submaps", lambda *given: ([], [told[0], told[0]]))
+        merge_step.merge_submaps(None, load_config(), None, Path())
+    monkeypatch.setattr(merge_step, "_read_submaps", lambda *given: ([], [told[0], told[0]]))
     with pytest.raises(DisagreementError, match=r"two objects$"):
-        merging.merge_submaps(None, load_config(), None, Path())
+        merge_step.merge_submaps(None, load_config(), None, Path())

@@ -17,7 +17,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.submaps import merge_step, plan_step, steps
+from tracking3d.submaps import merge_step, plan_step, split_run
 from tracking3d.submaps.alignment import DisagreementError
 from tracking3d.submaps.job import SplitResult
 from tracking3d.submaps.plan import PARTS
@@ -97,7 +97,7 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     def refuse(*given):
         raise DisagreementError("parts 1 and 2: they tell of two objects")
 
-    monkeypatch.setattr(steps, "track_part", track)
+    monkeypatch.setattr(split_run, "track_part", track)
     monkeypatch.setattr(merge_step, "merge_submaps", refuse)
     monkeypatch.setattr(merge_step, "_find_running", lambda tracked: None)
     run = tmp_path / "run"
@@ -123,7 +123,7 @@ def test_parts_of_other_settings_are_not_gone_on_with(short, tmp_path, monkeypat
     def fail(tell, job):
         raise OutputError("The disk is full.")
 
-    monkeypatch.setattr(steps, "track_part", fail)
+    monkeypatch.setattr(split_run, "track_part", fail)
     run = tmp_path / "run"
     with pytest.raises(OutputError):
         record_in_parts(short, settings(short), run, PromptSet(), length="25f", workers=1)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracking3d.geometry.alignment import is_rigid
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.rigid import is_rigid
 from tracking3d_bench.synthesis.motions import make_path
 from tracking3d_bench.synthesis.pick_up import PICK_UP
 from tracking3d_bench.synthesis.spec import Motion, SequenceSpec

@@ -14,7 +14,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, list_plugins, load_plugin
 from tracking3d.testing import check_tracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 from tracking3d.trackers.precomputed import PrecomputedMasks
 
 

@@ -10,7 +10,7 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.crops import crop_window, paste_mask
 from tracking3d.trackers.outline import both_sides
-from tracking3d.trackers.search import find_by_colours
+from tracking3d.trackers.segmentation import find_by_colours
 
 
 @pytest.fixture

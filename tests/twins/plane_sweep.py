@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.reconstruction.grid import FloatArray
+from tracking3d.reconstruction.meshing import FloatArray
 from tracking3d.reconstruction.plane_sweep import AGREEING, LEAST_CONTRAST, RADIUS
 
 

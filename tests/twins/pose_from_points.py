@@ -13,13 +13,9 @@ from tracking3d.bundle_adjustment.reprojection import (
     transform_to_camera,
 )
 from tracking3d.estimation.online.optimization.pnp import _shares
-from tracking3d.estimation.online.optimization.pnp_types import (
-    CONVERGED,
-    FIRST_DAMPING,
-    MOST_DAMPING,
-    PnPFit,
-    PointEquations,
-)
+from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
+from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
 from twins.reprojection import pixel_by_point, pixel_by_pose
 
 

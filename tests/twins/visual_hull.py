@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from tracking3d.reconstruction.grid import FloatArray
+from tracking3d.reconstruction.meshing import FloatArray
 from tracking3d.reconstruction.shape_views import ShapeView
 
 
 def robust_hull(
     points: FloatArray, views: Sequence[ShapeView], far: float, share: float, least: int
 ) -> tuple[FloatArray, FloatArray]:
-    """See `tracking3d.reconstruction.visual_hull.carve_hull`."""
+    """See `tracking3d.reconstruction.shape.carve_hull`."""
     P = np.stack([view.P for view in views])
     focal = np.array([view.K[0, 0] for view in views])
     inside = np.stack([view.depth_inside for view in views])

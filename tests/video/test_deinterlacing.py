@@ -11,7 +11,7 @@ import pytest
 from tracking3d.frames import Frame
 from tracking3d.video import open_source
 from tracking3d.video.any_frame import frame_images
-from tracking3d.video.deinterlacing import deinterlace
+from tracking3d.video.video_decoding import deinterlace
 
 HEIGHT, WIDTH, COUNT = 64, 96, 8
 

@@ -10,14 +10,14 @@ from rtsp_server import RtspCamera, packets_of
 from sample_videos import moving_picture
 
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video import open_source, stream
+from tracking3d.video import open_source, opening
 
 IMAGES = [moving_picture(index) for index in range(12)]
 
 
 @pytest.fixture
 def camera(monkeypatch) -> Iterator[RtspCamera]:
-    monkeypatch.setattr(stream, "PAUSE", 0.01)
+    monkeypatch.setattr(opening, "PAUSE", 0.01)
     camera = RtspCamera(packets_of(IMAGES), most=3)
     yield camera
     camera.close()
@@ -25,7 +25,7 @@ def camera(monkeypatch) -> Iterator[RtspCamera]:
 
 def test_a_camera_is_played_and_asked_again_when_it_is_lost(camera, caplog):
     source = open_source(camera.address)
-    assert isinstance(source, stream.LiveStream) and not source.repeatable
+    assert isinstance(source, opening.LiveStream) and not source.repeatable
     items = list(source)
     # The first connection was to look; what is not a frame was dropped, since another one had come.
     assert [item.index for item in items] == list(range(2 * len(IMAGES)))
@@ -36,7 +36,7 @@ def test_a_camera_is_played_and_asked_again_when_it_is_lost(camera, caplog):
         assert np.argmin(away) == frame.index % len(IMAGES), "the pictures that were sent, in their order"
     assert [frame.time for frame in frames] == sorted(frame.time for frame in frames)
     assert camera.methods[:4] == ["OPTIONS", "DESCRIBE", "SETUP", "PLAY"]
-    assert camera.connections == 3 + stream.TRIES
+    assert camera.connections == 3 + opening.TRIES
     assert "trying again" in caplog.text and "could not be reconnected" in caplog.text
 
 

@@ -15,7 +15,7 @@ from sample_videos import encode_video, moving_picture, shown_numbers
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video import open_source, stream
+from tracking3d.video import open_source, opening
 from tracking3d.video.addresses import SCHEMES
 
 
@@ -30,9 +30,9 @@ class Files(Silent, SimpleHTTPRequestHandler):
 
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch) -> None:
-    monkeypatch.setattr(stream, "OPENING", 0.5)
-    monkeypatch.setattr(stream, "READING", 0.5)
-    monkeypatch.setattr(stream, "PAUSE", 0.01)
+    monkeypatch.setattr(opening, "OPENING", 0.5)
+    monkeypatch.setattr(opening, "READING", 0.5)
+    monkeypatch.setattr(opening, "PAUSE", 0.01)
 
 
 @pytest.fixture
@@ -118,21 +118,21 @@ def test_a_stream_that_is_lost_is_asked_for_again_a_few_times(tmp_path, serve, c
     handler = type("Handler", (Live,), {"data": of_transport_stream(tmp_path), "connections": 0})
     host = serve(handler)
     source = open_source(f"http://{host}/live")
-    assert isinstance(source, stream.LiveStream) and not source.repeatable and source.count is None
+    assert isinstance(source, opening.LiveStream) and not source.repeatable and source.count is None
     items = list(source)
     assert [item.index for item in items] == list(range(20))  # two connections, the first one was to look
     assert any(isinstance(item, Frame) for item in items)
     assert all(isinstance(item, Frame) or "dropped" in item.reason for item in items)
     assert "trying again in 0.01 s (1 of 3)" in caplog.text
     assert "could not be reconnected after 3 attempts" in caplog.text
-    assert handler.connections == 3 + stream.TRIES
+    assert handler.connections == 3 + opening.TRIES
 
 
 def test_a_stream_that_ends_again_and_again_has_ended(tmp_path, serve, caplog):
     handler = type("Handler", (Live,), {"data": of_transport_stream(tmp_path), "connections": 0, "most": 50})
     items = list(open_source(f"http://{serve(handler)}/live"))
-    assert handler.connections == 2 + stream.TRIES  # the first one was to look
-    assert [item.index for item in items] == list(range(10 * (1 + stream.TRIES)))
+    assert handler.connections == 2 + opening.TRIES  # the first one was to look
+    assert [item.index for item in items] == list(range(10 * (1 + opening.TRIES)))
     assert "ended 4 times" in caplog.text
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tracking3d.video import open_source
-from tracking3d.video.tone_mapping import WHITE, ToneMapping, hlg_to_scene, light_to_pq, pq_to_light
+from tracking3d.video.picture_conversion import WHITE, ToneMapping, hlg_to_scene, light_to_pq, pq_to_light
 
 TO_2020 = np.linalg.inv(
     np.array(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
+import csv
+import io
 import json
 import os
 import posixpath
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -14,10 +17,18 @@ from typing import Any
 
 from tracking3d.batch.datasets import Dataset, dataset_reader
 from tracking3d.batch.one_video import LOGS
-from tracking3d.batch.rows import UnusableRow, VideoRow
-from tracking3d.batch.sidecar_files import videos_of
-from tracking3d.batch.storage import absolute, is_folder, local, parent
-from tracking3d.batch.tables import is_table, read_table
+from tracking3d.batch.rows import UnusableRow, VideoRow, check_texts, printable, read_row
+from tracking3d.batch.storage import (
+    absolute,
+    base,
+    is_folder,
+    join_path,
+    local,
+    matches,
+    names_in,
+    parent,
+    read,
+)
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, Tracking3dError
@@ -216,3 +227,195 @@ def _job(row: VideoRow, name: str, size: int, configure: Configure, split: str) 
         fault="" if fault == NO_PROMPT and not needs_prompt(config) else fault,
         split=row.split or split,
     )
+
+
+# fmt: off
+VIDEOS = frozenset((
+    ".3gp", ".avi", ".flv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg",
+    ".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
+))
+# fmt: on
+"""Names that count as videos in a folder."""
+
+BOX, JSON = ".box", ".json"
+MASKS = (".png", ".mask.png", ".jpg", ".mask.jpg")
+"""Suffixes added to a video's name, with or without its own suffix, for the files with its prompts."""
+
+
+def videos_of(place: str) -> list[tuple[VideoRow, int]]:
+    """The videos of a folder and of folders within it, or those that a pattern names; and the bytes of each.
+
+    A folder of images counts as a video if a file next to it gives its prompt.
+
+    Raises:
+        InputError: If there is none, or a file next to one is damaged.
+    """
+    if is_folder(place):
+        sizes = names_in(place, everything=True)
+        names = _videos_among(sizes)
+        found = [(join_path(place, name), sizes.get(name, 0)) for name in names]
+        beside = {join_path(place, name) for name in sizes}
+    else:
+        found = [(one, 0) for one in matches(place) if not _is_prompt(one)]
+        folders = {parent(one) for one, _ in found}
+        sizes = {
+            join_path(folder, name): size for folder in folders for name, size in names_in(folder).items()
+        }
+        found = [(one, sizes.get(one, 0)) for one, _ in found]
+        beside = set(sizes)
+    if not found:
+        raise InputError(
+            f"{place} contains no video; give a folder with videos, or a pattern such as 'clips/*.mp4'."
+        )
+    return [(_with_prompt(video, beside), size) for video, size in found]
+
+
+def _videos_among(names: Iterable[str]) -> list[str]:
+    """Files with the suffix of a video, and folders of images with a sidecar file."""
+    every = set(names)
+    hidden = {name for name in every if any(part.startswith(".") for part in name.split("/"))}
+    files = {name for name in every - hidden if PurePosixPath(name).suffix.lower() in VIDEOS}
+    folders = {str(PurePosixPath(name).parent) for name in every - hidden} - {"."}
+    return sorted(files | {folder for folder in folders if any(f"{folder}{end}" in every for end in _ends())})
+
+
+def _is_prompt(place: str) -> bool:
+    return place.endswith(_ends()) or base(place).startswith(".")
+
+
+def _ends() -> tuple[str, ...]:
+    return (BOX, JSON, *MASKS)
+
+
+def _with_prompt(video: str, beside: set[str]) -> VideoRow:
+    """The row of a video from its sidecar files; without a prompt if there is none."""
+    stems = [video, video.removesuffix(PurePosixPath(base(video)).suffix)]
+    for stem in stems:
+        if (file := stem + JSON) in beside:
+            return _from_json(file, video)
+        if (file := stem + BOX) in beside:
+            text = (read(file) or b"").decode("utf-8", "replace")
+            boxes = [line.strip() for line in text.splitlines() if line.strip()]
+            return read_row({"video": video, "box": boxes}, file)
+        for end in MASKS:
+            if (file := stem + end) in beside and file != video:
+                return read_row({"video": video, "mask": [file]}, file)
+    return VideoRow(video=video)
+
+
+def _from_json(file: str, video: str) -> VideoRow:
+    try:
+        values = json.loads(read(file) or b"")
+        if not isinstance(values, dict):
+            raise ValueError("it is not a JSON object")
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{file} cannot be read ({error}); it must hold the same keys as a row of a table."
+        ) from error
+    check_texts(values, file)
+    return read_row({**values, "video": video}, file)
+
+
+SUFFIXES = (".csv", ".jsonl", ".ndjson", ".parquet")
+_WITH_COLUMNS = (".csv", ".parquet")
+_LONGEST_NAME = 240  # bytes that file systems allow, less a suffix
+
+
+def is_table(place: str) -> bool:
+    """Whether a place is called as a table is."""
+    return PurePosixPath(place).suffix.lower() in SUFFIXES
+
+
+def read_table(place: str) -> list[VideoRow | UnusableRow]:
+    """The rows of a table, those that cannot be used among them.
+
+    Raises:
+        InputError: If there is no such table, it has a column of an unknown name, or no row can be used.
+    """
+    content = read(place)
+    if content is None:
+        raise InputError(f"The table {place} does not exist.")
+    suffix = PurePosixPath(place).suffix.lower()
+    try:
+        if suffix == ".parquet":
+            read_values = _parquet(content)
+        elif suffix == ".csv":
+            read_values = _csv(content)
+        else:
+            read_values = _json_lines(content)
+        found = list(read_values)
+    except (ValueError, csv.Error, RecursionError) as error:
+        raise InputError(f"The table {place} cannot be read ({error}).") from error
+    if not found:
+        raise InputError(f"The table {place} has no rows.")
+    rows: list[VideoRow | UnusableRow] = []
+    for number, values in found:
+        try:
+            rows.append(_row(values, f"Line {number} of {place}"))
+        except InputError as error:
+            known = not isinstance(values, dict) or values.keys() <= VideoRow.model_fields.keys()
+            if not known and suffix in _WITH_COLUMNS:  # wrong in every row
+                raise
+            video = values.get("video") if isinstance(values, dict) else None
+            video = printable(video) if isinstance(video, str) else ""
+            rows.append(UnusableRow(number, video, str(error)))
+    first = rows[0]
+    if isinstance(first, UnusableRow) and all(isinstance(row, UnusableRow) for row in rows):
+        raise InputError(first.reason)
+    return rows
+
+
+def _row(values: Any, where: str) -> VideoRow:
+    """The row of what a line holds, or of why it could not be read.
+
+    Raises:
+        InputError: If it cannot be one.
+    """
+    if isinstance(values, ValueError):
+        raise InputError(f"{where} cannot be read ({values}).") from values
+    if not isinstance(values, dict):
+        raise InputError(f"{where} is not a JSON object with a value for each column.")
+    check_texts(values, where)
+    row = read_row(values, where)
+    for column, text in (("video", row.video), ("name", row.name or "")):
+        if any(len(part.encode()) > _LONGEST_NAME for part in text.split("/")):
+            raise InputError(f"{where}: column {column} has a name of {len(text)} characters; shorten it.")
+    return row
+
+
+def _json_lines(content: bytes) -> Iterator[tuple[int, Any]]:
+    for number, line in enumerate(content.removeprefix(codecs.BOM_UTF8).splitlines(), 1):
+        if line.strip():
+            try:
+                yield number, json.loads(line.decode())
+            except ValueError as error:
+                yield number, error
+            except RecursionError:
+                yield number, ValueError("it is too deeply nested")
+
+
+def _csv(content: bytes) -> Iterator[tuple[int, Any]]:
+    # What is not UTF-8 becomes a lone surrogate, which is found in the row where it is.
+    text = content.decode("utf-8-sig", "surrogateescape")
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    columns = reader.fieldnames or ()
+    if twice := next((name for name in columns if list(columns).count(name) > 1), None):
+        raise ValueError(f"it has two columns {twice}; remove one")
+    for values in reader:
+        if values.pop(None, None):
+            yield reader.line_num, ValueError("it has more values than there are columns")
+        else:
+            yield reader.line_num, values
+
+
+def _parquet(content: bytes) -> Iterator[tuple[int, Any]]:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise InputError("Parquet tables need pyarrow: pip install 'tracking3d[export]'.") from error
+    try:
+        table = parquet.read_table(io.BytesIO(content))
+    except (pyarrow.ArrowException, OSError) as error:
+        raise ValueError(str(error)) from error
+    yield from enumerate(table.to_pylist(), 1)

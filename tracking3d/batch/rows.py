@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ValidationError
 
 from tracking3d.config.explain import describe_validation_error
-from tracking3d.config.section import Section
+from tracking3d.config.models import Section
 from tracking3d.errors import InputError
 from tracking3d.prompts.boxes import BoxFormat
 

@@ -13,14 +13,15 @@ from typing import Any
 from tracking3d.batch.folder import BatchProgress, Failure, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
-from tracking3d.batch.overview import write_overview
-from tracking3d.batch.storage import join_path, local, read_many
+from tracking3d.batch.storage import base, join_path, local, read_many, write
 from tracking3d.batch.summary import MARKER, read_marker
 from tracking3d.batch.tasks import Tasks, is_finished_video
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
 from tracking3d.errors import OutputError
+from tracking3d.report.rendering import render_page
+from tracking3d.results import layout
 from tracking3d.results.files import writing
 from tracking3d.results.layout import refuse_root
 from tracking3d.results.lock import try_lock
@@ -315,3 +316,51 @@ def _alone(out: str) -> Iterator[None]:
         if not try_lock(lock.fileno()):
             raise OutputError(f"{out} is in use by another batch; wait for it or choose another --out.")
         yield
+
+
+MOST_PICTURES = 2000
+"""Maximum number of runs with a picture; of more, those with the lowest confidence get one."""
+
+
+def write_overview(
+    out: str,
+    progress: BatchProgress,
+    rows: Sequence[Mapping[str, Any]],
+    pictures: Mapping[str, str],
+    failures: Sequence[Failure],
+    report: bool = True,
+) -> None:
+    """Write the page.
+
+    Args:
+        out: The folder of the batch.
+        progress: How far it is.
+        rows: Rows of the table of results.
+        pictures: JPEG in base64 by run.
+        failures: Videos that came to nothing.
+        report: Whether the runs have reports.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    doubtful = sorted(rows, key=lambda row: 0.0 if row["confidence"] is None else row["confidence"])
+    pictured = {row["run"] for row in doubtful[:MOST_PICTURES]}
+    runs = [
+        {
+            **row,
+            "picture": pictures.get(row["run"], "") if row["run"] in pictured else "",
+            "link": f"{row['run']}/{layout.REPORT}" if report else "",
+        }
+        for row in sorted(rows, key=lambda row: row["run"])
+    ]
+    page = render_page(
+        "batch.html",
+        ("batch.js",),
+        title=base(out) or "batch",
+        progress=progress,
+        runs=runs,
+        failures=failures,
+        frames=sum(row["frames"] for row in rows),
+        seconds=sum(row["seconds"] for row in rows),
+    )
+    write(join_path(out, layout.INDEX), page)

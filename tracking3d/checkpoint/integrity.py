@@ -19,7 +19,7 @@ from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord, latest
 from tracking3d.results.run_reader import LONGEST_LINE, RunReader
-from tracking3d.video.opencv_log import silent_opencv
+from tracking3d.video.image_file import silent_opencv
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,11 @@ import typer
 from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug, Quiet
-from tracking3d.cli.options.panels import VIDEO
+from tracking3d.cli.options.general import VIDEO
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from tracking3d.calibration.boards import Board
-    from tracking3d.calibration.calibrate import Calibration
+    from tracking3d.calibration.calibrate import Board, Calibration
 
 MOST_FRAMES = 150
 """Frames of a video in which the board is detected, spread evenly over it."""
@@ -154,7 +153,7 @@ def video(
 
 
 def _board(kind: str, squares: str, square: float) -> Board:
-    from tracking3d.calibration.boards import Board, parse_squares
+    from tracking3d.calibration.calibrate import Board, parse_squares
 
     if kind not in ("charuco", "chessboard"):
         raise InputError(f"--board {kind} is unknown; give charuco or chessboard.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tracking3d.cli.options import AsJson, Debug, Quiet
-from tracking3d.cli.options.panels import OUTPUT
+from tracking3d.cli.options.general import OUTPUT
 
 if TYPE_CHECKING:
     from tracking3d.report.differences import RunComparison

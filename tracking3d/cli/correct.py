@@ -43,8 +43,7 @@ def correct(
 
     for folder in runs_in(run):
         check_run_folder(folder)
-    from tracking3d.cli.plans import plan_run
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import load_with_progress, plan_run, show_progress
     from tracking3d.cli.report import report_at_end
     from tracking3d.cli.summary import print_summary
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, configure
-from tracking3d.cli.options.panels import OUTPUT
+from tracking3d.cli.options.general import OUTPUT
 
 
 def demo(
@@ -28,8 +28,7 @@ def demo(
     """
     import json
 
-    from tracking3d.cli.plans import plan_run
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import load_with_progress, plan_run, show_progress
     from tracking3d.cli.report import report_at_end
     from tracking3d.cli.summary import print_summary
     from tracking3d.cli.tables import print_figures

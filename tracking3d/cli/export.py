@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import AsJson, Debug, Quiet, Video, grouped, numbers
-from tracking3d.cli.options.object_size import ObjectSize
-from tracking3d.cli.options.panels import OUTPUT, VIDEO
+from tracking3d.cli.options.general import OUTPUT, VIDEO
+from tracking3d.cli.options.output import ObjectSize
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, Run, Video
-from tracking3d.cli.options.choices import model_option
-from tracking3d.cli.options.object_size import ObjectSize
+from tracking3d.cli.options.general import model_option
+from tracking3d.cli.options.output import ObjectSize
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def _refuse_quality(value: str | None) -> None:
     """Answer the former option ``--quality fast|fine``."""
-    from tracking3d.config.choices import check_quality
+    from tracking3d.config.loading import check_quality
 
     if value is not None:
         check_quality(value)
@@ -72,7 +72,7 @@ def model(
 
     take_over(run)
     from tracking3d.reconstruction.final_shape import texture_limits
-    from tracking3d.report.renewal import renew_report
+    from tracking3d.report.several import renew_report
     from tracking3d.results.run_reader import RunReader
 
     config = _settings_of_run(RunReader(run))
@@ -102,7 +102,7 @@ def _settings_of_run(run: RunReader) -> PipelineConfig:
     """The settings of a run, but with the final mesh that is made by default; those of an old version do not count."""
     from pydantic import ValidationError
 
-    from tracking3d.config.choices import set_model
+    from tracking3d.config.loading import set_model
     from tracking3d.config.models import PipelineConfig
 
     try:
@@ -134,8 +134,7 @@ def _default_model(run: RunReader, config: PipelineConfig, keeps: bool) -> str:
 
 def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: int, quiet: bool) -> list[str]:
     """Make the mesh of a run, and return what to print about it."""
-    from tracking3d.cli.plans import plan_shape, plan_texture
-    from tracking3d.cli.progress import show_progress
+    from tracking3d.cli.progress import plan_shape, plan_texture, show_progress
     from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
     from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader
@@ -165,8 +164,7 @@ def _extend_mesh(
     run: Path, earlier: Path, source: str | None, views: int, largest: int, quiet: bool
 ) -> list[str]:
     """Make the mesh of a run with the frames of an earlier one, and return what to print about it."""
-    from tracking3d.cli.plans import plan_shape
-    from tracking3d.cli.progress import show_progress
+    from tracking3d.cli.progress import plan_shape, show_progress
     from tracking3d.reconstruction.extension import extend_run
     from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader

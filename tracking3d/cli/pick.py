@@ -11,11 +11,9 @@ import typer
 
 from tracking3d.cli.model import check_model_source
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
-from tracking3d.cli.options.camera import CameraOptions
+from tracking3d.cli.options.general import OUTPUT
 from tracking3d.cli.options.output import Browser, Host, Overwrite, RunFolder
-from tracking3d.cli.options.panels import OUTPUT
-from tracking3d.cli.options.tracking import Features, Tracker, TrackingOptions
-from tracking3d.cli.options.video import Frames
+from tracking3d.cli.options.tracking import CameraOptions, Features, Frames, Tracker, TrackingOptions
 from tracking3d.cli.view import show_address
 
 if TYPE_CHECKING:
@@ -100,7 +98,7 @@ def track_picked(
         start: What tracks.
     """
     from tracking3d.cli.progress import load_with_progress
-    from tracking3d.picker.outcome import command_of
+    from tracking3d.picker.correction import command_of
 
     resume = page.picked is not None
     picked, options = page.wait(), request.options
@@ -215,14 +213,14 @@ def open_picker(
         OutputError: There is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
-    from tracking3d.picker.outcome import command_of, read_outcome, save_outcome, settings_as_yaml
+    from tracking3d.picker.correction import command_of, read_outcome, save_outcome, settings_as_yaml
     from tracking3d.picker.server import Picker
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
     from tracking3d.results.overwrite import check_output_folder
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
-    from tracking3d.video.selection import within
+    from tracking3d.video.source import within
     from tracking3d.web.access import Access
 
     source, folder, options = request.source, request.folder, request.options

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, Run, Video, grouped, numbers
-from tracking3d.cli.options.object_size import ObjectSize
-from tracking3d.cli.options.panels import OUTPUT
+from tracking3d.cli.options.general import OUTPUT
+from tracking3d.cli.options.output import ObjectSize
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -128,8 +128,7 @@ def points(
             raise OutputError(
                 f"{file} cannot be written: the folder {file.parent} does not exist; make it first."
             )
-    from tracking3d.cli.plans import plan_points
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import load_with_progress, plan_points, show_progress
 
     load_with_progress("tracking3d.results.point_tracking", quiet, kernels=True)
     from tracking3d.results.correspondences import grid_on_object, track_points
@@ -194,7 +193,7 @@ def _followed(
 def _write_files(
     tracks: PointTracks, images: FrameSource | None, csv: Path | None, video: Path | None
 ) -> None:
-    from tracking3d.results.point_files import points_to_csv
+    from tracking3d.results.correspondences import points_to_csv
     from tracking3d.results.point_trails import write_trails
 
     if csv is not None:
@@ -207,7 +206,7 @@ def _write_files(
 
 
 def _print(tracks: PointTracks, as_json: bool) -> None:
-    from tracking3d.results.point_files import points_to_csv, points_to_json
+    from tracking3d.results.correspondences import points_to_csv, points_to_json
 
     if as_json:
         typer.echo(points_to_json(tracks))
@@ -238,7 +237,7 @@ def _by_images(tracks: PointTracks) -> str:
 
 def _images(reader: RunReader, source: str | None, needed: bool) -> FrameSource | None:
     """The video of the run; None, with a remark, if it is missing and not needed."""
-    from tracking3d.results.run_source import open_run_source
+    from tracking3d.results.run_reader import open_run_source
 
     try:
         return open_run_source(reader, source)

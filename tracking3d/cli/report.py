@@ -31,8 +31,7 @@ def report(
 
     for folder in runs_in(run):
         check_run_folder(folder)
-    from tracking3d.cli.plans import plan_report
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import load_with_progress, plan_report, show_progress
 
     load_with_progress("tracking3d.report.several", quiet, kernels=True)
     from tracking3d.report.several import write_reports
@@ -63,7 +62,7 @@ def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], List
     Raises:
         KeyboardInterrupt: If the writing of the report was interrupted.
     """
-    from tracking3d.results.artefacts import times_written
+    from tracking3d.results.run_writer import times_written
 
     begun = False
 
@@ -89,8 +88,8 @@ def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], List
 
 def _is_due(folder: Path, before: tuple[int, ...]) -> bool:
     """Whether a finished run needs a report: it has none, or its files are not as they were."""
-    from tracking3d.results.artefacts import lacks_report, times_written
     from tracking3d.results.run_reader import is_finished
+    from tracking3d.results.run_writer import lacks_report, times_written
 
     return is_finished(folder) and (lacks_report(folder) or times_written(folder) != before)
 

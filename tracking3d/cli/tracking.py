@@ -52,15 +52,14 @@ class RunDisplay:
 
 def track(request: RunRequest, display: RunDisplay) -> None:
     """Track, show the progress, and print a summary."""
-    from tracking3d.cli.plans import plan_run
-    from tracking3d.cli.progress import show_progress
+    from tracking3d.cli.progress import plan_run, show_progress
     from tracking3d.cli.report import report_at_end
     from tracking3d.cli.view import watch
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import record_tracking
-    from tracking3d.results.artefacts import times_written
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
+    from tracking3d.results.run_writer import times_written
     from tracking3d.video import open_source
 
     folder, options, prompts = request.folder, request.options, request.prompts
@@ -121,7 +120,7 @@ def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, tuple[int,
         finished: When the files of the runs that had been finished before were written.
     """
     from tracking3d.cli.summary import print_summary
-    from tracking3d.results.artefacts import times_written
+    from tracking3d.results.run_writer import times_written
 
     for folder in folders:
         if finished.get(folder) == times_written(folder):

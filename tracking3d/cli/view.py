@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, Video
+from tracking3d.cli.options.general import OUTPUT
 from tracking3d.cli.options.output import Browser, Host
-from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.runtime.progress import report_progress
 
 if TYPE_CHECKING:

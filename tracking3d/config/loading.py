@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, cast, get_args
 
-from pydantic import ValidationError
+import yaml
+from pydantic import BeforeValidator, Field, ValidationError
 
-from tracking3d.config.choices import QUALITIES, check_quality
 from tracking3d.config.explain import describe_validation_error, format_value, hint
-from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
-from tracking3d.config.prompt_section import PromptSection
-from tracking3d.config.yaml_files import parse_yaml, read_mapping
+from tracking3d.config.models import AUTO, ObjectConfig, PipelineConfig, PluginChoice, Section
 from tracking3d.errors import InputError, argument
 
 _MOST_LEAVES = 12  # settings of a layer that are listed one by one
@@ -274,3 +272,261 @@ def _validate(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
     except ValidationError as error:
         prefix = f"{origin}: " if origin else ""
         raise InputError(prefix + describe_validation_error(error, PipelineConfig)) from error
+
+
+# The section ``prompt`` of a configuration file: the prompt, written as for ``tracking3d run``.
+#
+# It belongs to one video, not to the pipeline, so only ``run`` reads it.
+
+
+def _one_or_several(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Texts = Annotated[tuple[str, ...], BeforeValidator(_one_or_several)]
+"""One text or a list of them."""
+
+
+class PromptSection(Section):
+    """The objects to track; every value is written as on the command line."""
+
+    box: Texts = Field(
+        (), description="Box X,Y,W,H of the object in the first frame, or a list for several objects."
+    )
+    box_format: Literal["xywh", "xyxy"] | None = Field(
+        None,
+        description="How boxes are written here: xywh (X,Y,WIDTH,HEIGHT, the default) or xyxy (X1,Y1,X2,Y2).",
+    )
+    mask: Texts = Field(
+        (), description="Mask file of the object in the first frame, or a list for several objects."
+    )
+    points: Texts = Field(
+        (), description="Points 'X,Y+ X,Y-' in the first frame, or a list for several objects."
+    )
+    start_frame: int | None = Field(None, ge=0, description="Frame of the prompt, if not the first.")
+    correct: Texts = Field(
+        (), description="Correction FRAME:BOX, FRAME:MASK or FRAME:POINTS, or a list of several."
+    )
+
+
+Quality = Literal["draft", "good", "best"]
+"""Tracker, resolution, refinement and final mesh together, fastest first."""
+ModelChoice = Literal["auto", "none", "fast", "fine"]
+"""The final mesh: the online map's, with a texture from the video, with a reconstructed shape, or the best of these."""
+
+QUALITIES: tuple[str, ...] = get_args(Quality)
+MODELS: tuple[str, ...] = get_args(ModelChoice)
+
+_IN_A_FILE = {
+    "auto": "--model, in a file object.shape: auto",
+    "none": "--model, in a file object.texture_views: 0",
+    "fast": "--model, in a file object.shape: fast",
+    "fine": "--model, in a file object.shape: fine",
+}
+
+
+def check_quality(value: Any, file: Path | None = None) -> Quality:
+    """``value``, if it is a quality.
+
+    Args:
+        value: What was given.
+        file: The configuration file that it is from; None for an argument or option.
+
+    Raises:
+        InputError: It is not; if it is a final mesh, the sentence says where that is given.
+    """
+    if isinstance(value, str) and value in MODELS:
+        name, other = (
+            argument("quality=", "--quality"),
+            argument(f"model=: model='{value}'", f"--model: --model {value}"),
+        )
+        if file is not None:
+            name, other = f"{file}: quality", _IN_A_FILE[value]
+        raise InputError(f"{name} sets draft, good or best; {value} is a value of {other}.")
+    if value not in QUALITIES:
+        raise InputError(f"There is no quality {format_value(value)}; {hint(str(value), QUALITIES)}")
+    return cast(Quality, value)
+
+
+def check_model(value: Any) -> ModelChoice:
+    """``value``, if it is a final mesh.
+
+    Raises:
+        InputError: It is not; if it is a quality, the sentence says where that is given.
+    """
+    if isinstance(value, str) and value in QUALITIES:
+        name = argument("model=", "--model")
+        other = argument(f"quality= of load_config: quality='{value}'", f"--quality: --quality {value}")
+        raise InputError(f"{name} sets auto, none, fast or fine; {value} is a value of {other}.")
+    if not isinstance(value, str) or value not in MODELS:
+        name = argument(f"model={format_value(value)}", f"--model {value}")
+        raise InputError(f"{name} is unknown; give 'auto', 'none', 'fast' or 'fine'.")
+    return cast(ModelChoice, value)
+
+
+def set_model(config: PipelineConfig, model: ModelChoice | None) -> PipelineConfig:
+    """The configuration with another final mesh; the same if ``model`` is None.
+
+    Raises:
+        InputError: The object is known, so that its mesh is fixed, or frames are not re-estimated.
+    """
+    if model is None or (model == "auto" and config.object.model is not None):
+        return config
+    shape, name = config.object, argument(f"model='{model}'", f"--model {model}")
+    if model != "none" and shape.model is not None:
+        what = "shape" if model == "fine" else "texture"
+        raise InputError(
+            f"{name} makes the {what} again, but those of a known object are fixed; leave it out, or leave out "
+            f"{argument('object=', '--object')}."
+        )
+    if model == "fast" and not config.solver.final_refine:
+        raise InputError(
+            f"{name} takes the texture from the frames as they are re-estimated, which they are not without the final "
+            "refinement (solver.final_refine); leave it out."
+        )
+    default = ObjectConfig.model_fields["texture_views"].default
+    some = shape.texture_views or default
+    views = {"auto": some, "none": 0, "fast": some, "fine": shape.texture_views}[model]
+    changed = {"texture_views": views, "shape": "fast" if model == "none" else model}
+    return config.model_copy(update={"object": shape.model_copy(update=changed)})
+
+
+_LONGEST = 256 << 10
+_MOST_VALUES = 100_000
+_DEEPEST = 60
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """PyYAML's safe loader (no tag runs code), which also refuses duplicate keys and keys that are not text."""
+
+
+def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[str] = set()
+    for key_node, _ in node.value:
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            continue
+        key = loader.construct_object(key_node, deep=True)
+        if not isinstance(key, str):
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key {format_value(key)} is not text", key_node.start_mark
+            )
+        if key in seen:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key '{key}' is given twice", key_node.start_mark
+            )
+        seen.add(key)
+    # deep, so that a mapping that contains itself is found here and not followed for ever elsewhere
+    return loader.construct_mapping(node, deep=True)
+
+
+_StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+def parse_yaml(text: str, origin: str) -> Any:
+    """Parse one YAML document.
+
+    Args:
+        text: The document.
+        origin: Its name in messages, such as the file name.
+
+    Raises:
+        InputError: Not YAML, a tag that is not plain data, a key given twice or a key that is not text.
+    """
+    return _parse(text, origin)[0]
+
+
+def _parse(text: str, origin: str) -> tuple[Any, list[str]]:
+    """The document, and the keys of its top level that have no value."""
+    loader = None
+    try:
+        loader = _StrictLoader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None, []
+        _check_size(node)
+        pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+        empty = [
+            key.value
+            for key, value in pairs
+            if isinstance(value, yaml.ScalarNode) and not value.end_mark.index - value.start_mark.index
+        ]
+        return loader.construct_document(node), empty
+    except yaml.constructor.ConstructorError as error:
+        problem = error.problem or "a value cannot be read"
+        if "could not determine a constructor" in problem:
+            tag = problem.rpartition("tag ")[2].replace("tag:yaml.org,2002:", "!!")
+            problem = f"the tag {tag} is refused: configurations are plain data and never run code"
+        raise InputError(f"{origin}: {problem}{_place(error)}.") from error
+    except yaml.MarkedYAMLError as error:
+        problem = error.problem or "it cannot be parsed"
+        if problem.startswith("but "):  # PyYAML's sentence begins in the context
+            problem = f"{error.context}, {problem}"
+        raise InputError(f"{origin} is not valid YAML: {problem}{_place(error)}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        what = "nested too deeply" if isinstance(error, RecursionError) else str(error).splitlines()[0]
+        raise InputError(f"{origin} is not valid YAML: {what}.") from error
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def _check_size(root: yaml.Node) -> None:
+    """Refuse deep nesting, and aliases that expand to more than any configuration holds.
+
+    Raises:
+        ValueError: There is too much of either.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: yaml.Node, depth: int) -> int:
+        if depth > _DEEPEST:
+            raise ValueError("nested too deeply")
+        if id(node) not in sizes:
+            sizes[id(node)] = 0  # a node that contains itself is refused when it is constructed
+            inner = node.value if isinstance(node, yaml.CollectionNode) else ()
+            parts = (part for item in inner for part in (item if isinstance(item, tuple) else (item,)))
+            sizes[id(node)] = 1 + sum(size(part, depth + 1) for part in parts)
+        return sizes[id(node)]
+
+    if size(root, 0) > _MOST_VALUES:
+        raise ValueError(f"its aliases expand to more than {_MOST_VALUES:,} values")
+
+
+def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
+    """Read a YAML file whose top level is a mapping; an empty file gives an empty mapping.
+
+    Args:
+        file: The file.
+        empty: Value of a top-level key that has nothing after its colon.
+
+    Raises:
+        InputError: The file cannot be read, is too long, is not text, or holds something other than a mapping.
+    """
+    try:
+        with file.open("rb") as opened:
+            content = opened.read(_LONGEST + 1)
+        if len(content) > _LONGEST:
+            raise InputError(
+                f"{file} is longer than {_LONGEST >> 10} KiB, too long for a configuration; give another file."
+            )
+        text = content.decode("utf-8-sig")
+    except FileNotFoundError as error:
+        raise InputError(f"The configuration file {file} does not exist.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is not a text file; a configuration is YAML in UTF-8.") from error
+    except OSError as error:
+        raise InputError(f"The configuration file {file} cannot be read: {error.strerror}.") from error
+    data, left_empty = _parse(text, str(file))
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        kind = "a list" if isinstance(data, list) else "a single value"
+        raise InputError(
+            f"{file} has {kind} at its top level; a configuration is a mapping such as 'tracker: csrt'."
+        )
+    return {**data, **dict.fromkeys(left_empty, empty)}
+
+
+def _place(error: yaml.MarkedYAMLError) -> str:
+    mark = error.problem_mark or error.context_mark
+    return f" (line {mark.line + 1}, column {mark.column + 1})" if mark else ""

@@ -6,6 +6,7 @@ Conventions: OpenCV camera axes (x right, y down, z forward), ``T_cam_obj`` maps
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.answers import PointAnswers
+from tracking3d.points.online import PointAnswers
 from tracking3d.runtime.stage_times import StageTimes
 
 
@@ -174,3 +175,109 @@ def mark_failed(estimate: FrameEstimate, failure: str) -> FrameEstimate:
         confidence=estimate.confidence / 2,
         failure=failure,
     )
+
+
+SURE = 0.9
+"""Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
+would teach it as many errors as it mends, and what it was taught wrongly comes back as evidence."""
+
+WORTH_CORRECTING = (0.5, 0.9)
+"""IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
+width of an outline; below, one of them is of something else, and nobody knows which."""
+
+
+RELOCALIZED = "relocalized"
+"""What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame; where the
+mask tracker was elsewhere or had nothing, it is set on what was found, however sure that is."""
+
+
+ELSEWHERE = 0.2
+"""IoU of the object's silhouette, or mask, with the initial mask up to which that is of something else."""
+
+
+MOTION_RATIO = "motion_ratio"
+"""In `FrameEstimate.diagnostics`: the share of the mask by which it differs from the initial mask because of parts that
+move as the object does."""
+
+MOVES = 0.02
+"""Such a share from which on the answer is handed back, however sure it is: a side that turns into view lies beside the
+mask for a few frames only, and a pose that is judged by a mask without it cannot be sure."""
+
+
+def corrects(estimate: FrameEstimate) -> bool:
+    """Whether an estimate is confident enough, and differs enough from the initial mask, to be fed back."""
+    moving = estimate.diagnostics.get(MOTION_RATIO, 0.0) >= MOVES
+    if estimate.status is not Status.TRACKED and not moving:
+        return False
+    if estimate.initial_mask is None:
+        return estimate.hypothesis == RELOCALIZED
+    visible = estimate.visible_mask
+    both = int(np.count_nonzero(visible & estimate.initial_mask))
+    either = int(np.count_nonzero(visible | estimate.initial_mask))
+    if estimate.hypothesis == RELOCALIZED and both <= ELSEWHERE * either:
+        return True
+    least, most = WORTH_CORRECTING
+    if not both or both < least * either:
+        return False
+    return moving or (estimate.confidence >= SURE and both <= most * either)
+
+
+def with_initial_mask(estimate: FrameEstimate) -> FrameEstimate:
+    """An estimate whose mask is its initial mask, and so for the estimates that it revises.
+
+    A frame without an initial mask keeps the mask of its estimate.
+    """
+    revised = tuple(with_initial_mask(one) for one in estimate.revised)
+    if estimate.initial_mask is None:
+        return replace(estimate, revised=revised)
+    return replace(
+        estimate,
+        mask=estimate.initial_mask,
+        mask_source=MaskSource.INITIAL,
+        probability=None,
+        diagnostics={**estimate.diagnostics, MOTION_RATIO: 0.0},
+        revised=revised,
+    )
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """A judgement of one frame."""
+
+    status: Status
+    reason: str
+    confidence: float
+
+
+def assess(
+    appearance: float,
+    silhouette: float,
+    has_mask: bool,
+    tau: float,
+    silhouette_limit: float,
+    failure: str = "",
+) -> Assessment:
+    """Judge one frame by its losses (paper section 3.4: failure is an appearance loss not below tau).
+
+    Args:
+        appearance: ``L_F`` of the frame.
+        silhouette: ``L_S`` of the frame; not looked at without a mask.
+        has_mask: Whether there was an initial mask.
+        tau: Convergence threshold of the appearance loss.
+        silhouette_limit: A silhouette loss above this is doubtful.
+        failure: A numerical failure, in words.
+    """
+    if failure:
+        return Assessment(Status.LOST, failure, 0.0)
+    if not math.isfinite(appearance) or appearance >= tau:
+        return Assessment(
+            Status.LOST, f"the appearance loss {appearance:.3f} did not fall below {tau:g}", 0.0
+        )
+    agreement = max(0.0, 1.0 - silhouette) if has_mask else 0.5
+    confidence = agreement * (1.0 - 0.5 * appearance / tau)
+    if not has_mask:
+        return Assessment(Status.UNCERTAIN, "there was no initial mask to compare with", confidence)
+    if silhouette >= silhouette_limit:
+        reason = f"the silhouette disagrees with the initial mask (loss {silhouette:.2f})"
+        return Assessment(Status.UNCERTAIN, reason, confidence)
+    return Assessment(Status.TRACKED, "", confidence)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
-from tracking3d.estimation.prototype_start import RADIUS
+from tracking3d.estimation.shape import RADIUS
 from tracking3d.geometry.camera import Camera
 
 
@@ -17,7 +17,7 @@ from tracking3d.geometry.camera import Camera
 class KnownObject:
     """An object that an earlier run, a scan or a drawing knows.
 
-    Solvers have it with its middle at the origin and a radius of `tracking3d.estimation.prototype_start.RADIUS`, since
+    Solvers have it with its middle at the origin and a radius of `tracking3d.estimation.shape.RADIUS`, since
     their tolerances are made for that; what they answer is turned back into the object's own coordinates and unit.
     """
 

@@ -6,7 +6,10 @@ data: a frame that cannot be estimated is answered with a status and a reason, n
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from bisect import bisect
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
@@ -14,9 +17,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
-from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoEstimates, PhotoSet
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.shape import Shape
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
@@ -187,3 +188,93 @@ class GuidedSolver(Protocol, Generic[State]):
     def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
         """The state before ``step`` takes a frame whose mask ``(H, W)`` the user has given."""
         ...
+
+
+@dataclass(frozen=True)
+class ModelCoverage:
+    """The part of a video that a model explains."""
+
+    confidence: Mapping[int, float]  # of each frame that was estimated with it, by index
+    anchors: frozenset[int]  # keyframes of which the pose is reliable: the object can be tracked from there
+
+
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """Consecutive frames, some of which the object's model does not explain, next to a keyframe."""
+
+    anchor: Frame  # the keyframe's frame
+    # the frames with their initial masks, the nearest to anchor first; they can be iterated once
+    frames: Iterable[tuple[Frame, MaskEstimate]]
+    backwards: bool  # whether they come before anchor
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Frames as photos, which need not follow each other closely; ``read`` gives some, as often as it is called."""
+
+    indices: tuple[int, ...]  # of those in which the object was seen, in order
+    read: Callable[[Collection[int]], Iterator[tuple[Frame, MaskEstimate]]]
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoEstimates:
+    """What a solver makes of a set of photos."""
+
+    estimates: tuple[FrameEstimate, ...]  # with the map of those that were joined; empty if there is none
+    reason: str  # which photos are not joined, and what to do about that; empty if all are
+
+
+_Pose = NDArray[np.float64]
+LEAST_FRAMES = 4
+"""Frames whose estimates stay; with fewer, nothing is known of how the refinement moved the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedStart:
+    """Poses and surface as a final refinement left them, to be continued with causal estimates of some other frames.
+
+    The refinement may have rotated and scaled the object and changed the focal length; frames whose estimates stay have
+    both poses, which tell how a causal pose is to be changed.
+    """
+
+    camera: Camera  # the camera of the refined poses
+    vertices: NDArray[np.float64]  # (V, 3) the refined surface, with the topology of the solver's
+    refined: Mapping[int, _Pose]  # (4, 4) refined poses by frame index, of at least `LEAST_FRAMES` frames
+    causal: Mapping[int, _Pose]  # the same frames' causal poses
+    focal: Mapping[int, float]  # the focal length in pixels that each causal pose belongs to
+
+    @cached_property
+    def scale(self) -> float:
+        """Length of a causal unit in refined units."""
+        depths = [
+            (self.refined[index][2, 3], self.causal[index][2, 3] * self.camera.fx / self.focal[index])
+            for index in self.refined
+        ]
+        return float(np.median([after / before for after, before in depths]))
+
+    @cached_property
+    def _indices(self) -> list[int]:
+        return sorted(self.refined)
+
+    def predict(self, index: int, T_cam_obj: _Pose, focal: float) -> _Pose:
+        """The refined pose ``(4, 4)`` that a causal one amounts to: by the frame nearest in time.
+
+        Args:
+            index: Index of the frame.
+            T_cam_obj: ``(4, 4)`` its causal pose.
+            focal: The focal length in pixels that this belongs to.
+        """
+        if index in self.refined:
+            return self.refined[index]
+        after = bisect(self._indices, index)
+        around = self._indices[max(after - 1, 0) : after + 1]
+        nearest = min(around, key=lambda one: abs(one - index))
+        there = self._scaled(self.causal[nearest], self.focal[nearest])
+        return self._scaled(T_cam_obj, focal) @ np.linalg.inv(there) @ self.refined[nearest]
+
+    def _scaled(self, T_cam_obj: _Pose, focal: float) -> _Pose:
+        """A causal pose in refined units and with the refined focal length, under which the object keeps its size."""
+        T = T_cam_obj.copy()
+        T[:3, 3] *= self.scale
+        T[2, 3] *= self.camera.fx / focal
+        return T

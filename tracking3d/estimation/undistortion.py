@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
-from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoEstimates, PhotoSet
-from tracking3d.estimation.refined_start import RefinedStart
 from tracking3d.estimation.solver import (
     ContinuingSolver,
     ExtendingSolver,
+    Gap,
     GuidedSolver,
     LiveSolver,
+    ModelCoverage,
+    PhotoEstimates,
+    PhotoSet,
     PhotoSolver,
+    RefinedStart,
     RefiningSolver,
     Solver,
     State,

@@ -16,13 +16,12 @@ from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.layout import METRE, runs_in
-from tracking3d.results.mesh_export import load_model
+from tracking3d.results.mesh_export import cut_unseen, load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import metres_per_unit, scale_model, scale_pose
-from tracking3d.results.unseen_surface import cut_unseen
 from tracking3d.runtime.progress import report_each
-from tracking3d.video.selection import parse_selection
+from tracking3d.video.source import parse_selection
 
 FRAMES_PER_SECOND = 30.0
 """Assumed by formats that require a frame rate if it is unknown."""

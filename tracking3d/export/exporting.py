@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tracking3d.config.explain import nearest
 from tracking3d.config.object_size import check_object_size
 from tracking3d.errors import InputError, OutputError, argument
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
-from tracking3d.export.other_names import similar_formats
 from tracking3d.results.layout import (
     ARBITRARY,
     EXPORT,
@@ -144,7 +144,7 @@ def export_run(
 
 def _without_video(exporter: Exporter, options: ExportOptions, run: RunReader) -> tuple[ExportOptions, str]:
     """The options, without images if the format can do without them and the video is gone, and what to say of it."""
-    from tracking3d.results.run_source import open_run_source
+    from tracking3d.results.run_reader import open_run_source
 
     named = "The source that was given"
     if "images" not in exporter.options:
@@ -252,3 +252,46 @@ def _replace_when_done(path: Path) -> Iterator[Path]:
 def _remove(folder: Path) -> None:
     if folder.is_dir():
         shutil.rmtree(folder)
+
+
+OTHER_NAMES = {
+    "gltf": ("glb", "animated-glb"),
+    **dict.fromkeys(("usd", "usda", "usdc"), ("usdz",)),
+    **dict.fromkeys(("ros", "ros2", "rosbag", "bag", "db3"), ("ros-bag",)),
+    "obj": ("glb", "nuke"),
+    "fbx": ("animated-glb", "usdz"),
+    "abc": ("animated-glb", "usdz"),
+    "alembic": ("animated-glb", "usdz"),
+    "ae": ("after-effects",),
+    "jsx": ("after-effects",),
+    "chan": ("nuke",),
+    "blend": ("blender",),
+    "rrd": ("rerun",),
+    "mov": ("prores",),
+    "webm": ("vp9",),
+    "mp4": ("vp9", "prores"),
+    "video": ("vp9", "prores"),
+    "png": ("davis", "cut-outs"),
+    "masks": ("davis", "coco", "vot"),
+    "json": ("coco", "nerfstudio"),
+    "nerf": ("nerfstudio",),
+    "instant-ngp": ("nerfstudio",),
+    "gaussian-splatting": ("colmap",),
+    "3dgs": ("colmap",),
+    "trajectory": ("tum", "kitti"),
+    "txt": ("tum",),
+    "poses": ("csv", "tum", "bop"),
+    "points": ("points-csv", "tapvid"),
+    "npz": ("tapvid",),
+    "mesh": ("glb", "ply", "stl"),
+}
+"""By name in small letters, without a dot before it."""
+
+
+def similar_formats(name: str, formats: Iterable[str]) -> list[str]:
+    """The formats that are likely meant by ``name``, which is none of them; none if nothing comes close."""
+    known = list(formats)
+    if meant := [one for one in OTHER_NAMES.get(name.lower().lstrip("."), ()) if one in known]:
+        return meant
+    best = nearest(name, known)
+    return [] if best is None else [best]

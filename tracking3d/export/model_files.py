@@ -15,8 +15,7 @@ from trimesh.exchange.stl import export_stl
 
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.seen_surface import vertex_colours
-from tracking3d.results.mesh_export import glb_file
-from tracking3d.results.unseen_surface import find_seen_vertices
+from tracking3d.results.mesh_export import find_seen_vertices, glb_file
 
 
 def write_glb(run: ExportedRun, path: Path) -> None:

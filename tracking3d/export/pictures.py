@@ -7,8 +7,7 @@ from collections.abc import Container, Iterator
 from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, SkippedFrame, pixels
-from tracking3d.results.run_reader import RunReader
-from tracking3d.results.run_source import places_of
+from tracking3d.results.run_reader import RunReader, places_of
 from tracking3d.video import open_source
 
 _SOURCE = argument("source=", "--source")

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.export.exported_run import ExportedRun
-from tracking3d.results.correspondences import PointTracks, check_asked, track_points
-from tracking3d.results.point_files import points_to_csv
+from tracking3d.results.correspondences import PointTracks, check_asked, points_to_csv, track_points
 
 _GRID = 100
 """Approximate number of points if none are given."""

@@ -23,7 +23,7 @@ from tracking3d.export.exported_run import ExportedRun, PosedFrame
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_source import places_of
+from tracking3d.results.run_reader import places_of
 from tracking3d.video.recording_time import recording_time
 
 CAMERA_FRAME = "tracking3d_camera_optical"

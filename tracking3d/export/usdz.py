@@ -19,8 +19,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.export.axes import HALF_TURN, continuous, quaternion
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.geometry.camera import Camera
-from tracking3d.results.mesh_export import unit_note
-from tracking3d.results.unseen_surface import PALE, UNSEEN, find_seen_faces
+from tracking3d.results.mesh_export import PALE, UNSEEN, find_seen_faces, unit_note
 
 _APERTURE = 36.0
 """Millimetres of the film's width; only its ratio to the focal length means anything."""

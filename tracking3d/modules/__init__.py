@@ -1,6 +1,11 @@
 """The renderer, its silhouette and its losses as ``nn.Module``, and our cameras and poses as kornia's."""
 
-from tracking3d.modules.conversions import (
+from tracking3d.modules.losses import LaplacianLoss, OutlineLoss, SilhouetteLoss, TextureLoss
+from tracking3d.modules.renderer import (
+    MeshRenderer,
+    RenderedViews,
+    Silhouette,
+    TexturedMesh,
     camera_from_pinhole,
     pinhole_of_camera,
     pose_from_se3,
@@ -9,8 +14,6 @@ from tracking3d.modules.conversions import (
     se3_from_matrix,
     se3_of_pose,
 )
-from tracking3d.modules.losses import LaplacianLoss, OutlineLoss, SilhouetteLoss, TextureLoss
-from tracking3d.modules.renderer import MeshRenderer, RenderedViews, Silhouette, TexturedMesh
 
 __all__ = [
     "LaplacianLoss",

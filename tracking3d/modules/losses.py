@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from tracking3d.estimation.paper.losses import iou_loss, laplacian_loss
+from tracking3d.estimation.paper.problem import iou_loss, laplacian_loss
 from tracking3d.geometry.mesh import uniform_laplacian
 from tracking3d.modules.renderer import RenderedViews
 from tracking3d.rendering import contour_loss, find_contour, signed_distance, texture_losses

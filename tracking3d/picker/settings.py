@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tracking3d.config.choices import MODELS, QUALITIES
+from tracking3d.config.loading import MODELS, QUALITIES
 from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.plugins import FEATURES, TRACKERS, list_plugins

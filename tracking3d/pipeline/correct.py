@@ -9,8 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.checkpoint.rollback import prompt_record_in
-from tracking3d.checkpoint.staging import keeps_shape, take_over
+from tracking3d.checkpoint.staging import keeps_shape, prompt_record_in, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
@@ -23,8 +22,7 @@ from tracking3d.results import layout
 from tracking3d.results.given_masks import read_given_mask
 from tracking3d.results.layout import runs_in
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader
-from tracking3d.results.run_source import open_run_source
+from tracking3d.results.run_reader import RunReader, open_run_source
 
 
 def correct_run(

@@ -13,18 +13,17 @@ from tracking3d.checkpoint.progress import check_picture
 from tracking3d.checkpoint.run_state import RunState
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
-from tracking3d.pipeline.earlier_refinement import EarlierRefinement
+from tracking3d.pipeline.frame_reading import SavedMasks
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import (
     Decision,
+    EarlierRefinement,
     PrecomputedRefinement,
     RefinementSteps,
     Retracking,
 )
-from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.reconstruction import TextureView, keep_best_views, texture_view
-from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
-from tracking3d.reconstruction.held_adjustment import HeldAdjustment
+from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, HeldAdjustment
 from tracking3d.rendering.backend import share_threads
 from tracking3d.results.files import decode_mask
 from tracking3d.results.records import FrameRecord

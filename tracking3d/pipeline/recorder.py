@@ -14,21 +14,23 @@ from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.pipeline.earlier_refinement import EarlierRefinement, find_earlier_refinement
 from tracking3d.pipeline.final_refinement import FinalRefinement
+from tracking3d.pipeline.frame_reading import SavedMasks
 from tracking3d.pipeline.lost_frames import explain_lost_frames
 from tracking3d.pipeline.open_tracking import TrackedObject
-from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
-from tracking3d.pipeline.saved_masks import SavedMasks
+from tracking3d.pipeline.refinement_steps import (
+    EarlierRefinement,
+    PrecomputedRefinement,
+    find_earlier_refinement,
+)
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture, close_unseen
 from tracking3d.reconstruction.final_shape import is_reconstructed
-from tracking3d.results.initial_masks import is_initial_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
-from tracking3d.results.run_writer import RunWriter
+from tracking3d.results.run_writer import RunWriter, is_initial_mask
 from tracking3d.runtime.concurrency import BackgroundWriter
 from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource

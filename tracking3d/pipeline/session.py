@@ -12,10 +12,16 @@ from numpy.typing import NDArray
 from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
+from tracking3d.estimation.estimate import (
+    FrameEstimate,
+    ObjectModel,
+    Status,
+    corrects,
+    lost_estimate,
+    mark_failed,
+    with_initial_mask,
+)
 from tracking3d.estimation.solver import GuidedSolver, LiveSolver, Solver
-from tracking3d.estimation.tracker_feedback import corrects
-from tracking3d.estimation.trusted_masks import with_initial_mask
 from tracking3d.estimation.undistortion import undistort_solver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
@@ -29,7 +35,7 @@ from tracking3d.pipeline.components import (
     check_backward_tracking,
     select_renderer,
 )
-from tracking3d.pipeline.frame_order import FrameOrder
+from tracking3d.pipeline.frame_reading import FrameOrder
 from tracking3d.pipeline.known_object import load_known_object, select_camera
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.session_refinement import SessionRefinement

@@ -11,22 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
-from tracking3d.estimation.estimate import FrameEstimate, mark_failed
-from tracking3d.estimation.gap import Gap, ModelCoverage, PhotoSet
-from tracking3d.estimation.refined_start import RefinedStart
+from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask
 from tracking3d.estimation.solver import (
     ContinuingSolver,
     ExtendingSolver,
+    Gap,
     GuidedSolver,
+    ModelCoverage,
+    PhotoSet,
     PhotoSolver,
+    RefinedStart,
     RefiningSolver,
     Solver,
 )
-from tracking3d.estimation.trusted_masks import with_initial_mask
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.components import add_times
-from tracking3d.pipeline.frame_order import FrameOrder
+from tracking3d.pipeline.frame_reading import FrameOrder
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.runtime.isolation import IsolatedRuntime
 from tracking3d.runtime.stage_times import StageTimes, measure

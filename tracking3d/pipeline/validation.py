@@ -38,7 +38,7 @@ def check_frame(frame: Any) -> None:
     """
     if not isinstance(frame, Frame):
         raise InputError(f"frame= is {a_kind(frame)}; wrap the image: Frame(index, image).")
-    from tracking3d.video.image_input import check_image
+    from tracking3d.video.in_memory import check_image
 
     check_image(frame.image, frame.name or f"Frame {frame.index}")
 

@@ -14,14 +14,15 @@ from functools import cached_property, partial
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.reversal import Reversal
+from tracking3d.bundle_adjustment.adjustment import Reversal
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.robust_bundle import bundle, other_way_round
-from tracking3d.points.surface import move_surface
 from tracking3d.points.track_chaining import follow_chain
 from tracking3d.points.view import Array, SurfaceView, redraw_surface
 from tracking3d.points.warping import Warps
@@ -341,3 +342,98 @@ def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> Corne
     face, barycentric = surface_under(*view.project(vertices), faces, xy)
     on = face >= 0
     return face[on], barycentric[on], xy[on]
+
+
+_STAY = 1e-3  # weight that holds every vertex, so that there is one answer
+
+
+def move_surface(
+    vertices: Array,
+    faces: NDArray[np.int64],
+    face: NDArray[np.int64],
+    barycentric: Array,
+    landmarks: Array,
+    stiffness: float = 1.0,
+) -> Array:
+    """Move a mesh so that points on it come to lie on their landmarks.
+
+    The movement is smooth (its Laplacian is small) and robust: a landmark much further off than most counts little.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        face: ``(N,)`` the face that each point lies on.
+        barycentric: ``(N, 3)`` where on it.
+        landmarks: ``(N, 3)``.
+        stiffness: Weight of the smoothness.
+
+    Returns:
+        ``(V, 3)`` vertices.
+    """
+    count = len(face)
+    if not count:
+        return vertices
+    rows = np.repeat(np.arange(count), 3)
+    on = sparse.csr_matrix((barycentric.ravel(), (rows, faces[face].ravel())), shape=(count, len(vertices)))
+    gap = landmarks - on @ vertices
+    length = np.linalg.norm(gap, axis=1)
+    weight = 1 / (1 + (length / (3 * np.median(length) + 1e-12)) ** 2)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    joined = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2).tocsr()
+    joined = ((joined + joined.T) > 0).astype(float)
+    neighbours = np.maximum(np.asarray(joined.sum(1)).ravel(), 1)
+    laplacian = sparse.eye(len(vertices)) - sparse.diags(1 / neighbours) @ joined
+    H = (
+        on.T @ sparse.diags(weight) @ on
+        + stiffness * (laplacian.T @ laplacian)
+        + _STAY * sparse.eye(len(vertices))
+    )
+    moved: Array = vertices + spsolve(H.tocsc(), on.T @ (weight[:, None] * gap))
+    return moved
+
+
+TURNS = 2
+_FIXED = 1e-6  # deviation in radii of points that stay where they are
+
+
+def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tuple[SurfaceView, float]:
+    """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
+
+    The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
+
+    Args:
+        scene: Surface and views, refined; see `tracking3d.points.landmark_adjustment.refine_scene`.
+        view: The further one, drawn at about its pose.
+        known: Which views of the scene are looked at; those near in time show most of what it shows.
+    """
+    share = 0.0
+    for _ in range(TURNS):
+        others = [scene.views[index] for index in known]
+        warps = Warps([*others, view], TOLERANCE * scene.radius)
+        found = [
+            _carry_tracks(scene, warps, source, index)
+            for source, index in enumerate(known)
+            if others[source] is not None
+        ]
+        if not found:
+            return view, share
+        points, measured, deviation = (np.concatenate(part) for part in zip(*found, strict=True))
+        placed = bundle(
+            points,
+            view.intrinsics[None],
+            view.T_cam_obj[None],
+            measured[None],
+            deviation[None],
+            _FIXED * scene.radius,
+        )
+        share = float(placed.agreeing[0].mean()) if len(points) else 0.0
+        view = redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+    return view, share
+
+
+def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int, index: int) -> tuple[Array, Array, Array]:
+    """Points in space under corners of a view, their pixels in the last warped view, and deviations of these."""
+    face, barycentric, xy = scene.seeds_of(index)
+    points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
+    carried = warps.carry(source, len(warps.views) - 1, xy)
+    return points, carried.measured, np.sqrt(carried.variance + DEVIATION**2)

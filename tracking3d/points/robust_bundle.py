@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
-from tracking3d.bundle_adjustment.reversal import Reversal, reversal_of
+from tracking3d.bundle_adjustment.adjustment import Reversal, reversal_of
 from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.points.view import Array
 
@@ -75,7 +75,7 @@ def intersect(
         The points, and the weights ``(T, N)`` that the measurements had in the end: 0 if there is none.
     """
     from tracking3d.points.kernels.intersection import intersect as compiled
-    from tracking3d.rendering.kernels.threads import share
+    from tracking3d.rendering.kernels.compilation import share
 
     known = np.isfinite(deviation) & np.isfinite(measured).all(2)
     certain = np.where(known, 1 / np.where(known, deviation, 1.0) ** 2, 0.0)

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 
-from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import Assessment, Status
 from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.results.records import FrameRecord

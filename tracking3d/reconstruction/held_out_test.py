@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.photometric_poses import coloured_surface, refine_views
 from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import render
 
 EVERY = 8
@@ -73,3 +75,67 @@ def score_held_out(
         both = covered & mask
         differences.append(float(apart[both].mean()) if both.any() else 1.0)
     return HeldOutScore(float(np.mean(overlaps)), float(np.mean(differences)))
+
+
+_UNCOVERED = 0.5
+"""Colour that is counted where the mask is and the model is not."""
+_MOST_DECIBELS = 60.0
+
+
+@dataclass(frozen=True)
+class HeldOutScores:
+    """Mean scores of frames that were left out; within the mask, as far as colours there are surely the object's."""
+
+    frames: int  # how many
+    psnr: float  # peak signal-to-noise ratio, decibels
+    ssim: float  # structural similarity (Wang et al., 2004)
+    covered: float  # share of the mask that the model covers
+
+
+def held_out_scores(
+    model: ObjectModel, used: Sequence[ShapeView], left_out: Sequence[tuple[ShapeView, TextureView]]
+) -> HeldOutScores:
+    """Render the model as the frames that were left out should show it, and compare.
+
+    Args:
+        model: With a texture that those frames gave nothing to.
+        used: The frames that it was made from, for the colours that poses are fitted by.
+        left_out: The others, at least one, as shapes and as textures are made from them; their poses alone are fitted.
+    """
+    surface = coloured_surface(model.vertices, model.faces, used)
+    fitted = refine_views(surface, [shape for shape, _ in left_out])
+    each = [_compare(model, view, shape.T_cam_obj) for shape, (_, view) in zip(fitted, left_out, strict=True)]
+    psnr, ssim, covered = np.mean(each, axis=0)
+    return HeldOutScores(len(each), float(psnr), float(ssim), float(covered))
+
+
+def _compare(
+    model: ObjectModel, view: TextureView, T_cam_obj: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    from kornia.metrics import psnr
+    from skimage.metrics import structural_similarity
+
+    T = torch.from_numpy(T_cam_obj[None]).float()
+    drawn = render(
+        torch.from_numpy(model.vertices).float(),
+        torch.from_numpy(model.faces),
+        torch.from_numpy(model.face_uvs).float(),
+        torch.from_numpy(model.texture).permute(2, 0, 1).float() / 255,
+        T[:, :3, :3],
+        T[:, :3, 3],
+        torch.from_numpy(view.K[None]).float(),
+        (len(view.image), len(view.image)),
+    )
+    picture, inside = view.image / 255.0, view.valid > 0
+    covered = drawn.face_index[0].numpy() >= 0
+    predicted = np.where(covered[..., None], drawn.image()[0].permute(1, 2, 0).numpy(), _UNCOVERED)
+    predicted = np.where(inside[..., None], predicted, picture)  # outside the mask nothing is predicted
+    ratio = psnr(torch.from_numpy(predicted[inside]), torch.from_numpy(picture[inside]), 1.0)
+    _, similarity = structural_similarity(
+        picture, predicted, channel_axis=2, full=True, data_range=1.0, gaussian_weights=True
+    )
+    return (
+        min(float(ratio), _MOST_DECIBELS),  # it is infinite if the two are the same
+        float(similarity[inside].mean()),
+        float(covered[inside].mean()),
+    )

@@ -11,8 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from tracking3d.reconstruction.grid import FloatArray, Grid
-from tracking3d.reconstruction.meshing import decimate_roughly, extract_surface, main_pieces
+from tracking3d.reconstruction.meshing import FloatArray, Grid, decimate_roughly, extract_surface, main_pieces
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
 from tracking3d.reconstruction.plane_sweep import Guide
 from tracking3d.reconstruction.seen_vertices import seen_vertices

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.geometry.mesh import vertex_normals
-from tracking3d.reconstruction.grid import FloatArray
+from tracking3d.reconstruction.meshing import FloatArray
 from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import project

@@ -11,15 +11,18 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.reconstruction.held_out_scores import HeldOutScores, held_out_scores
-from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
-from tracking3d.reconstruction.reliable_frames import no_reliable_frame_error, reliable_frames
-from tracking3d.reconstruction.run_views import RunViews, collect_views, views_of_frame
+from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, HeldOutScores, held_out_scores, is_held_out
+from tracking3d.reconstruction.run_views import (
+    RunViews,
+    collect_views,
+    no_reliable_frame_error,
+    reliable_frames,
+    views_of_frame,
+)
 from tracking3d.reconstruction.shape import MOST, reconstruct_shape
 from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
-from tracking3d.reconstruction.texturing import bake_texture
+from tracking3d.reconstruction.texturing import bake_texture, replace_shape
 from tracking3d.reconstruction.unseen_closing import close_unseen
-from tracking3d.reconstruction.uv_atlas import replace_shape
 from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model

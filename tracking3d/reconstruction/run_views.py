@@ -2,24 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import cv2
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.frames import Frame
+from tracking3d.checkpoint.progress import checksum
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.estimation.online.features.sift import Keypoints, detect
+from tracking3d.frames import Frame, Image, pixels
+from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
-from tracking3d.reconstruction.reliable_frames import reliable_frames
 from tracking3d.reconstruction.shape import MOST
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
-from tracking3d.reconstruction.surface_keypoints import SurfaceKeypoints, shows_other_side, surface_keypoints
 from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
+from tracking3d.rendering.renderer import project
+from tracking3d.rendering.visibility import rasterize
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
+from tracking3d.trackers.crops import box_of
+from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource
+
+_APART = 8.0  # degrees between frames
+_MOST = 60  # frames
+_MARGIN = 3  # pixels that keypoints stay away from the outline, where the surface is steep
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceKeypoints:
+    """Keypoints of one frame."""
+
+    keypoints: Keypoints  # the N keypoints; pixels are the frame's
+    points: NDArray[np.float64]  # (N, 3) in object coordinates
+    P: NDArray[np.float64]  # (3, 4) from object coordinates to pixels of the frame, times the depth
+    T_cam_obj: NDArray[np.float64]  # (4, 4)
+    length: float  # longer side of the object in the frame, pixels
+
+
+def shows_other_side(kept: Sequence[SurfaceKeypoints], T_cam_obj: NDArray[np.float64]) -> bool:
+    """Whether a frame with a pose ``(4, 4)`` shows something that the frames at hand do not."""
+    if len(kept) >= _MOST:
+        return False
+    traces = [np.trace(one.T_cam_obj[:3, :3].T @ T_cam_obj[:3, :3]) for one in kept]
+    return max(traces, default=-1.0) < 1 + 2 * np.cos(np.radians(_APART))
+
+
+def surface_keypoints(
+    image: Image,
+    mask: NDArray[np.bool_],
+    camera: Camera,
+    T_cam_obj: NDArray[np.float64],
+    model: ObjectModel,
+) -> SurfaceKeypoints:
+    """Detect keypoints on the object where its surface is known.
+
+    Args:
+        image: ``(H, W, 3)`` RGB.
+        mask: ``(H, W)`` what is seen of the object.
+        camera: Camera of the frame.
+        T_cam_obj: ``(4, 4)``.
+        model: The object.
+    """
+    height, width = mask.shape
+    K = camera.K
+    T = torch.from_numpy(np.asarray(T_cam_obj, np.float64)[None]).float()
+    screen, z = project(
+        torch.from_numpy(model.vertices).float(), T[:, :3, :3], T[:, :3, 3], torch.from_numpy(K[None]).float()
+    )
+    depth = rasterize(screen, z, torch.from_numpy(model.faces), (height, width)).depth[0].numpy()
+    kernel = np.ones((2 * _MARGIN + 1,) * 2, np.uint8)
+    region = cv2.erode((mask & np.isfinite(depth)).astype(np.uint8), kernel) > 0
+    box = box_of(mask)
+    length = float(max(box[2:])) if box is not None else 1.0
+    found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), region, length)
+    P = K @ np.asarray(T_cam_obj)[:3]
+    column, row = np.rint(found.pixel).astype(int).T if len(found) else np.zeros((2, 0), int)
+    there = depth[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
+    rays = np.column_stack([found.pixel, np.ones(len(found))]) @ np.linalg.inv(K).T
+    known = np.isfinite(there)
+    camera_points = rays[known] * there[known, None]
+    points = (camera_points - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3]
+    kept = Keypoints(found.pixel[known], found.descriptor[known])
+    return SurfaceKeypoints(kept, points, P, np.asarray(T_cam_obj), length)
+
 
 _View = TypeVar("_View", ShapeView, TextureView)
 _NEXT_RUN = 10_000_000  # added to frame indices of another run, so that views of several have different ones
@@ -99,3 +172,46 @@ def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[S
     shape = shape_view(frame.index, frame.image, run.pinhole_mask(frame.index), *pose)
     view = texture_view(frame.index, frame.image, run.visible_pinhole_mask(frame.index), *pose)
     return None if shape is None or view is None else (shape, view)
+
+
+def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterator[tuple[Frame, FrameRecord]]:
+    """Each frame that is tracked with enough confidence, with its estimate; as the camera of the poses sees it.
+
+    Args:
+        run: The run.
+        source: Its video, or its path; None for the one that it names.
+
+    Raises:
+        InputError: If it goes on, or the video is another one.
+    """
+    if run.state == "running":
+        raise InputError(f"The run {run.folder} is still going; wait for its end.")
+    video = source or str(run.description.get("source", ""))
+    if isinstance(video, str):
+        video = open_source(video, run.description.get("selection"))
+    name = video.name
+    records = {record.index: record for record in run.frames}
+    prompt = run.description.get("prompt") or {}
+    for frame in report_each("reading frames", video, video.count):
+        record = records.get(frame.index)
+        if not isinstance(frame, Frame) or record is None:
+            continue
+        expected = (run.camera.height, run.camera.width)
+        if frame.size != expected:
+            raise InputError(
+                f"{name} has frames of {pixels(frame.size)} pixels but the run {run.folder} of "
+                f"{pixels(expected)}; give its video by --source."
+            )
+        if frame.index == prompt.get("first_frame") and checksum(frame.image) != prompt.get(
+            "first_image_crc"
+        ):
+            raise InputError(
+                f"{name} does not begin as the video of the run {run.folder} did; give that by --source."
+            )
+        if record.status is Status.TRACKED:
+            yield replace(frame, image=run.camera_of(record).undistort(frame.image)), record
+
+
+def no_reliable_frame_error(run: RunReader) -> InputError:
+    """The message if there is no such frame."""
+    return InputError(f"No frame of the run {run.folder} is tracked; its mesh stays as it is.")

@@ -14,15 +14,17 @@ from functools import partial
 
 import cv2
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial import cKDTree
 
 from tracking3d.points.outline_fit import fit_to_outlines
-from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.held_out_test import HeldOutScore, score_held_out
-from tracking3d.reconstruction.mesh_distance import mesh_distance
 from tracking3d.reconstruction.meshing import (
+    FloatArray,
+    Grid,
     decimate_roughly,
     extract_surface,
     is_sound,
@@ -31,13 +33,10 @@ from tracking3d.reconstruction.meshing import (
 )
 from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
-from tracking3d.reconstruction.plane_sweep import Guide, depth_maps
+from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps
 from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
-from tracking3d.reconstruction.silhouette_coverage import restore_uncovered
-from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
-from tracking3d.reconstruction.visual_hull import carve_hull
 from tracking3d.runtime.concurrency import start_in_thread
-from tracking3d.runtime.progress import report_progress
+from tracking3d.runtime.progress import report_each, report_progress
 
 FEWEST = 8
 """Frames that a shape is made from."""
@@ -195,3 +194,296 @@ def _keep_mesh(
     why: str, old: HeldOutScore | None = None, new: HeldOutScore | None = None
 ) -> ReconstructedShape:
     return ReconstructedShape(None, None, f"The mesh keeps its shape: {why}.", old, new)
+
+
+_SAMPLES = 20_000
+_NEAREST = 2  # samples whose faces are asked for the exact distance
+_POINTS_AT_ONCE = 10_000  # so that what trimesh computes with them stays small
+
+
+def mesh_distance(
+    grid: Grid, vertices: NDArray[np.float64], faces: NDArray[np.int64], far: float
+) -> FloatArray:
+    """``(X * Y * Z,)`` distance from the surface, positive inside, cut off at ``far``.
+
+    Args:
+        grid: Where.
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)`` counter-clockwise seen from outside.
+        far: In the unit of the vertices.
+    """
+    points = grid.points
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    samples, of_face = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+    spread = np.sqrt(mesh.area / _SAMPLES)
+    around = np.flatnonzero(_cells_around(grid, samples, far))
+    rough, nearest = cKDTree(samples).query(
+        points[around], k=_NEAREST, eps=0.1, distance_upper_bound=far + 2 * spread
+    )
+    distance = np.full(len(points), far)
+    found = np.isfinite(rough).all(1)
+    around, faces_there = around[found], of_face[nearest[found]]
+    for first in range(0, len(around), _POINTS_AT_ONCE):
+        some = slice(first, first + _POINTS_AT_ONCE)
+        near = points[around[some]]
+        corners = mesh.triangles[faces_there[some].ravel()]
+        closest = trimesh.triangles.closest_point(corners, np.repeat(near, _NEAREST, axis=0))
+        exact = np.linalg.norm(closest.reshape(-1, _NEAREST, 3) - near[:, None], axis=2).min(1)
+        distance[around[some]] = np.minimum(exact, far)
+    return np.where(inside_mesh(grid, vertices, faces), distance, -distance).astype(np.float32)
+
+
+def _cells_around(grid: Grid, samples: NDArray[np.float64], far: float) -> NDArray[np.bool_]:
+    """``(X * Y * Z,)`` voxels that may be within ``far`` of samples ``(N, 3)``."""
+    empty = np.ones(grid.shape, np.bool_)
+    cell = np.rint((samples - grid.origin) / grid.spacing).astype(int)
+    cell = cell[((cell >= 0) & (cell < grid.shape)).all(1)]
+    empty[tuple(cell.T)] = False
+    if empty.all():
+        return np.ones(empty.size, np.bool_)
+    return np.asarray(distance_transform_edt(empty) * grid.spacing <= far + 2 * grid.spacing).ravel()
+
+
+def inside_mesh(grid: Grid, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """``(X * Y * Z,)`` whether voxels are inside a closed mesh: the surface is crossed inwards on the way along z.
+
+    A part that is turned inside out, as a deformed sphere may have them, has an inside, too.
+
+    Args:
+        grid: Where.
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+    """
+    # Slightly off the centres: edges and corners of a mesh often lie on round numbers.
+    shifted = (vertices - grid.origin) / grid.spacing + (1.234e-5, 2.345e-5, 0.0)
+    a, b, c = shifted[faces].transpose(1, 0, 2)
+    low = np.ceil(np.minimum(np.minimum(a, b), c)[:, :2]).clip(0)
+    high = np.floor(np.maximum(np.maximum(a, b), c)[:, :2]).clip(None, np.array(grid.shape[:2]) - 1)
+    width, height = (np.maximum(high - low + 1, 0).astype(int)).T
+    face = np.repeat(np.arange(len(faces)), width * height)
+    number = np.arange(len(face)) - np.repeat(np.cumsum(width * height) - width * height, width * height)
+    x = low[face, 0] + number // np.maximum(height[face], 1)
+    y = low[face, 1] + number % np.maximum(height[face], 1)
+    at = np.stack([x, y], 1)
+
+    def side(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+        along, to = (q - p)[:, :2], at - p[:, :2]
+        return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])
+
+    weights = np.stack([side(b[face], c[face]), side(c[face], a[face]), side(a[face], b[face])])
+    area = weights.sum(0)
+    hit = ((weights > 0).all(0) | (weights < 0).all(0)) & (area != 0)
+    z = (weights * np.stack([p[face, 2] for p in (a, b, c)])).sum(0)[hit] / area[hit]
+    crossings = np.zeros((*grid.shape[:2], grid.shape[2] + 1))
+    from_there = np.clip(np.ceil(z), 0, grid.shape[2]).astype(int)
+    # A face that is counter-clockwise seen from above has its outside above: below it one is inside.
+    np.add.at(crossings, (x[hit].astype(int), y[hit].astype(int), from_there), -np.sign(area[hit]))
+    return np.asarray(np.abs(crossings.cumsum(2)[..., :-1]) > 0.5).ravel()
+
+
+# Where a shape has to be larger, since views show the object where it is not.
+#
+# A shape that is too small leaves pixels of the masks uncovered. A voxel that is within the visual hull, and that
+# several views see at such pixels, is likely to be part of the object.
+
+LEAST_VIEWS = 3
+"""Views that have to see a voxel at a pixel of the object that the shape does not cover."""
+_TOLERANCE = 2  # pixels around the shape's silhouette that count as covered
+_COVERAGE_FACES = 6000
+
+
+def restore_uncovered(
+    grid: Grid, hull: FloatArray, shape: FloatArray, views: Sequence[ShapeView]
+) -> FloatArray:
+    """A shape's signed distance, with that of the hull where views show the object and the shape is too small.
+
+    Args:
+        grid: Where.
+        hull: ``(N,)`` signed distance from the visual hull, positive inside.
+        shape: ``(N,)`` from the shape, positive inside.
+        views: The frames.
+
+    Returns:
+        ``(N,)``.
+    """
+    found = extract_surface(grid, np.minimum(hull, shape))
+    if found is None:
+        return hull
+    mesh = decimate_roughly(found, _COVERAGE_FACES)
+    guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
+    asked = np.flatnonzero((hull > 0) & (shape <= 0))
+    points = grid.points[asked]
+    votes = np.zeros(len(asked), int)
+    for view in views:
+        uncovered = _uncovered_pixels(guide, view)
+        if uncovered.any():
+            x, y, z = view.P[:, :3].astype(np.float32) @ points.T + view.P[:, 3:].astype(np.float32)
+            z = np.maximum(z, 1e-6)
+            pixel = np.rint(np.stack([y, x]) / z)
+            inside = ((pixel >= 0) & (pixel < len(uncovered))).all(0)
+            row, column = pixel[:, inside].astype(int)
+            votes[inside] += uncovered[row, column]
+    restored = shape.copy()
+    missing = asked[votes >= LEAST_VIEWS]
+    restored[missing] = hull[missing]
+    return restored
+
+
+def _uncovered_pixels(guide: Guide, view: ShapeView) -> NDArray[np.bool_]:
+    """``(S, S)`` the pixels of a view's mask that a surface leaves uncovered, more than a few pixels off."""
+    depth, _ = guide.visible_to(view)
+    around = np.ones((2 * _TOLERANCE + 1,) * 2, np.uint8)
+    return view.mask & (cv2.dilate(np.isfinite(depth).astype(np.uint8), around) == 0)
+
+
+# All evidence of a shape in one truncated signed distance volume.
+#
+# Positive inside. What matched depths say of a voxel is a weighted mean (Curless and Levoy, "A volumetric method for
+# building complex models from range images", 1996): near a depth its distance from it, before it that the voxel is
+# free. Behind it nothing is known. The mesh of the online map is one more such measurement, a weak one, decisive where
+# nothing else knows. Nothing reaches beyond the visual hull. Among volumes that agree about as well with that, the one
+# with the least total variation is taken (Zach, Pock and Bischof, "A globally optimal algorithm for robust TV-L1 range
+# image integration", 2007): noise and holes go, and what nobody saw is closed by a small surface.
+
+FREE = 0.25
+"""Weight of a depth in the free space before it: a wrong depth would otherwise carve a tunnel."""
+PRIOR = 0.3
+"""Weight of the mesh, in depths."""
+VARIATION = 0.5
+"""Weight of the total variation of distances in truncations, voxel to voxel."""
+_STEEP = 0.1  # difference from voxel to voxel below which it counts with its square
+_ROUNDS = 80
+_STEP = 0.28  # the largest with which primal and dual steps converge in three dimensions is 1 / sqrt(12)
+
+
+def depth_evidence(
+    points: FloatArray, maps: Sequence[DepthMap], truncation: float
+) -> tuple[FloatArray, FloatArray]:
+    """What depth maps say.
+
+    Args:
+        points: ``(N, 3)`` in object coordinates.
+        maps: The depths.
+        truncation: Distances are cut off there.
+
+    Returns:
+        ``(N,)`` weighted sum of signed distances, and ``(N,)`` of weights.
+    """
+    total, weight = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    for one in report_each("fusing depths", maps):
+        P = one.view.P.astype(np.float32)
+        x, y, z = P[:, :3] @ points.T + P[:, 3:]
+        ahead = z > 1e-6
+        depth, score = _sample_depth(one, x, y, z, ahead)
+        behind = depth - z  # of the voxel to the surface: positive where it is free
+        known = np.isfinite(behind) & (behind > -truncation)
+        near = known & (behind < truncation)
+        say = np.where(near, 1.0, FREE) * score
+        total[known] -= (say * np.clip(behind, -truncation, truncation))[known]
+        weight[known] += say[known]
+    return total, weight
+
+
+def fuse_depth(
+    shape: tuple[int, int, int],
+    hull: FloatArray,
+    prior: FloatArray,
+    total: FloatArray,
+    weight: FloatArray,
+    truncation: float,
+    variation: float = VARIATION,
+) -> FloatArray:
+    """``(N,)`` signed distance of the surface in truncations, positive inside.
+
+    Args:
+        shape: Shape of the grid of N voxels.
+        hull: ``(N,)`` signed distance from the visual hull.
+        prior: ``(N,)`` from the mesh of the online map.
+        total: ``(N,)`` and weight: ``(N,)`` from `depth_evidence`.
+        truncation: Distances are cut off there.
+        variation: Weight of the total variation; 0 takes the mean as it is.
+    """
+    sum_of_weights = torch.from_numpy(weight + np.float32(PRIOR)).reshape(shape)
+    held = PRIOR * np.clip(prior / truncation, -1, 1)
+    mean = torch.from_numpy((total / truncation + held).astype(np.float32)).reshape(shape) / sum_of_weights
+    most = torch.from_numpy(np.clip(hull / truncation, -1, 1).astype(np.float32)).reshape(shape)
+    # Primal and dual steps by turns (Chambolle and Pock, 2011), with a Huber norm of the gradient.
+    distance = torch.minimum(mean, most)
+    ahead, dual = distance.clone(), torch.zeros(3, *shape)
+    for _ in range(_ROUNDS if variation else 0):
+        for axis in range(3):
+            steps = shape[axis] - 1
+            dual[axis].narrow(axis, 0, steps).add_(ahead.diff(dim=axis), alpha=_STEP)
+        dual /= 1 + _STEP * _STEEP / variation
+        dual /= (dual.square().sum(0).sqrt_() / variation).clamp_min_(1)
+        last, distance = distance, distance.clone()
+        for axis in range(3):
+            steps = shape[axis] - 1
+            flow = dual[axis].narrow(axis, 0, steps)
+            distance.narrow(axis, 0, steps).add_(flow, alpha=_STEP)
+            distance.narrow(axis, 1, steps).sub_(flow, alpha=_STEP)
+        distance.add_(sum_of_weights * mean, alpha=_STEP).div_(1 + _STEP * sum_of_weights)
+        distance = torch.minimum(distance, most)
+        ahead = 2 * distance - last
+    return np.asarray(distance.numpy().ravel())
+
+
+def _sample_depth(
+    one: DepthMap, x: FloatArray, y: FloatArray, z: FloatArray, ahead: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """The depth and score nearest to where each point is seen; a map knows every ``stride``-th pixel."""
+    stride = one.stride
+    depths, scores = one.depth[::stride, ::stride], one.score[::stride, ::stride]
+    last = len(depths) - 0.5
+    depth, score = np.full(len(x), np.nan, np.float32), np.zeros(len(x), np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = x / z / stride, y / z / stride
+        seen = ahead & (column > -0.5) & (column < last) & (row > -0.5) & (row < last)
+    at = np.rint(row[seen]).astype(int), np.rint(column[seen]).astype(int)
+    depth[seen], score[seen] = depths[at], scores[at]
+    return depth, score
+
+
+# The visual hull, robust against a share of wrong masks.
+#
+# A point is outside where enough views put it there. In each view its distance from the mask's outline is taken into
+# space by the point's depth; of these signed distances, negative outside, the hull has not the least one but the one at
+# a low rank: a few wrong masks, or a hand that passes, carve nothing. What is left is about the signed distance from
+# the hull, and smooth, so that a surface lies between the voxels.
+
+SHARE = 0.05
+"""Share of the views that see a point and may be wrong."""
+LEAST = 1
+"""And so many at least."""
+
+
+def carve_hull(
+    points: FloatArray,
+    views: Sequence[ShapeView],
+    far: float,
+    share: float = SHARE,
+    least: int = LEAST,
+) -> tuple[FloatArray, FloatArray]:
+    """Signed distance from the hull, positive inside, and by how many views it is known.
+
+    Args:
+        points: ``(N, 3)`` in object coordinates.
+        views: The frames.
+        far: Distances are cut off there.
+        share: Share of the views that may be wrong.
+        least: Number of views that may be wrong however few there are.
+
+    Returns:
+        ``(N,)`` and ``(N,)``. A point that no view sees is inside.
+    """
+    P = np.stack([view.P for view in views])
+    focal = np.array([view.K[0, 0] for view in views])
+    inside = np.stack([view.depth_inside for view in views])
+    within = np.stack([view.within for view in views])
+    from tracking3d.reconstruction.kernels.visual_hull import robust_hull as compiled
+
+    hull, seen = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    compiled(
+        np.ascontiguousarray(points, np.float32), P, focal, inside, within, share, least, far, hull, seen
+    )
+    return hull, seen

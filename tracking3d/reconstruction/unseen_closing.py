@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
 from tracking3d.reconstruction.seen_regions import select_large_regions
-from tracking3d.results.unseen_surface import find_seen_faces
+from tracking3d.results.mesh_export import find_seen_faces
 
 _LEAST = 12  # seen vertices that a hull is made of
 

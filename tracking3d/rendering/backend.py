@@ -96,7 +96,7 @@ def give_threads(renderer: Mapping[str, str | int]) -> None:
     by_kernels = renderer["backend"] == "numba"
     _set_torch_threads(1 if by_kernels else threads)
     if by_kernels:
-        from tracking3d.rendering.kernels.threads import set_num_threads
+        from tracking3d.rendering.kernels.compilation import set_num_threads
 
         set_num_threads(threads)
 
@@ -110,7 +110,7 @@ def threads_kept() -> Iterator[None]:
     finally:
         _set_torch_threads(of_torch)
         if _kernels_threads() != of_kernels:
-            from tracking3d.rendering.kernels.threads import set_num_threads
+            from tracking3d.rendering.kernels.compilation import set_num_threads
 
             set_num_threads(of_kernels)
 
@@ -128,7 +128,7 @@ def share_threads(threads: int) -> Iterator[None]:
 
 def _kernels_threads() -> int:
     """Threads of the kernels; the default if nobody has imported them, which takes its time."""
-    module = sys.modules.get("tracking3d.rendering.kernels.threads")
+    module = sys.modules.get("tracking3d.rendering.kernels.compilation")
     return int(module.get_num_threads()) if module else 1
 
 

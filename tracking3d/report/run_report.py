@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import base64
+import io
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from PIL import Image as Pillow
+from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
@@ -18,19 +23,19 @@ from tracking3d.report import figures
 from tracking3d.report.curves import Curve, curve, stretches
 from tracking3d.report.doubts import doubts_of, next_steps, outcome_of
 from tracking3d.report.frame_pictures import FramePictures, frame_pictures, jpeg_of
-from tracking3d.report.model_data import middle_of, model_data, read_model
-from tracking3d.report.probability_layer import probability_layers
 from tracking3d.report.rendering import render_page
 from tracking3d.report.settings import settings_of
-from tracking3d.report.turntable import write_turntable
 from tracking3d.results import layout
+from tracking3d.results.contact_sheet import render_view, side_shown, texture_of_views
 from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
 from tracking3d.results.files import write_atomic, writing
-from tracking3d.results.mesh_view import render_view, side_shown
+from tracking3d.results.layout import partial_path
+from tracking3d.results.mesh_export import load_model, split_mesh
 from tracking3d.results.notes import unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.runtime.progress import report_progress
+from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.video.writer import VideoWriter
 
 _MOST_LISTED = 30
 """Ranges of uncertain and lost frames that are named; the plots show all."""
@@ -290,3 +295,193 @@ def _round(value: float | None) -> float | None:
 
 def _text(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
+
+
+# The model of a run for the page's viewer: plain arrays and a texture image.
+#
+# The picture has two halves: above the colours, below how much of each texel was ever seen. The viewer paints what was
+# never seen in a pale colour of the page instead of a guess. As an alpha channel it would not do: browsers forget the
+# colour of what is transparent. If it would be large as PNG, it is WebP, in which the eye sees no difference.
+
+MOST_TEXTURE = 1_500_000
+"""Bytes of the picture; as text in the page it takes a third more."""
+_LARGE = 300_000  # bytes of a PNG that is not worth losing anything for
+_QUALITIES = (90, 75, 55, 30, 10)
+MOST_FACES = 200_000
+"""Faces of a model that is put into a page."""
+
+
+def read_model(folder: Path) -> ObjectModel:
+    """The model of a run, if it is one that can be drawn.
+
+    Raises:
+        InputError: If there is none, it cannot be read, or its arrays do not fit each other.
+    """
+    model = load_model(folder)
+    fault = _fault(model)
+    if fault:
+        raise InputError(
+            f"The model {folder / layout.FEATURES} {fault}; track again into another {layout.OUT}."
+        )
+    return model
+
+
+def middle_of(model: ObjectModel) -> NDArray[np.float64]:
+    """``(3,)`` the middle of the model's box, in object coordinates."""
+    middle: NDArray[np.float64] = (model.vertices.min(0) + model.vertices.max(0)) / 2
+    return middle
+
+
+def model_data(model: ObjectModel) -> dict[str, Any]:
+    """What the viewer draws: the mesh, centred and of radius 1, in object axes (y down), as base64 of float32.
+
+    Texture coordinates have their origin in the upper left of the picture's upper half.
+    """
+    plain = trimesh.visual.material.SimpleMaterial()
+    mesh = split_mesh(model, plain)
+    centred = mesh.vertices - middle_of(model)
+    radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
+    assert isinstance(mesh.visual, trimesh.visual.TextureVisuals)
+    uv = np.asarray(mesh.visual.uv) * (1, -1) + (0, 1)
+    seen = np.repeat(255 * (model.texture_weight > 0)[..., None].astype(np.uint8), 3, axis=2)
+    picture = np.concatenate([model.texture, seen])[..., ::-1]
+    return {
+        "positions": _floats(centred / radius),
+        "normals": _floats(mesh.vertex_normals),
+        "coordinates": _floats(uv),
+        "faces": _base64(np.asarray(mesh.faces, dtype="<u4").tobytes()),
+        "texture": _picture(picture),
+    }
+
+
+def _picture(picture: NDArray[np.uint8]) -> str:
+    """``(H, W, 3)`` BGR as the address of a picture within the page."""
+    plain = cv2.imencode(".png", picture)[1].tobytes()
+    if len(plain) <= _LARGE:
+        return f"data:image/png;base64,{_base64(plain)}"
+    for quality in _QUALITIES:
+        made = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+        if len(made) <= MOST_TEXTURE:
+            break
+    return f"data:image/webp;base64,{_base64(made)}"
+
+
+def _floats(values: NDArray[np.float64]) -> str:
+    return _base64(np.ascontiguousarray(values, dtype="<f4").tobytes())
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _fault(model: ObjectModel) -> str:
+    """Why the arrays are no model, or nothing."""
+    count = len(model.vertices)
+    shapes = (
+        model.vertices.shape == (count, 3)
+        and model.faces.ndim == 2
+        and model.faces.shape[1] == 3
+        and model.face_uvs.shape == (*model.faces.shape, 2)
+        and model.texture_weight.shape == model.texture.shape[:2]
+    )
+    if not shapes or not np.issubdtype(model.faces.dtype, np.integer):
+        return "has arrays of inconsistent sizes"
+    if not 0 < len(model.faces) <= MOST_FACES:
+        return f"has {len(model.faces)} faces"
+    if not 0 <= model.faces.min() <= model.faces.max() < count:
+        return "has faces with missing vertices"
+    if not (np.isfinite(model.vertices).all() and np.isfinite(model.face_uvs).all()):
+        return "has vertices with invalid coordinates"
+    return ""
+
+
+# Object probabilities as overlays for a page: small images of sixteen colours.
+#
+# Blue is hardly, yellow is surely the object, as in the viewer; what is below a thirtieth is transparent.
+
+BUDGET = 1_200_000
+"""Bytes of all layers of a page; as text in the page they take a third more."""
+WIDEST = 320
+"""Pixels across a layer; the page stretches it over the picture."""
+_STEPS = 16
+_FAINTEST, _STRONGEST = 40, 150  # of 255; what is hardly the object's is hardly covered
+
+
+def probability_layers(
+    run: RunReader, positions: Sequence[int], budget: int = BUDGET
+) -> tuple[bytes | None, ...]:
+    """A layer as PNG for each of some estimates; None for one without a probability, nothing if none has one.
+
+    Args:
+        run: The run.
+        positions: Positions in ``run.frames``.
+        budget: Bytes of all layers together; they get smaller until they fit.
+    """
+    width = min(WIDEST, run.camera.width)
+    shown = [_grey(run.probability(run.frames[position].index), width) for position in positions]
+    if all(one is None for one in shown):
+        return ()
+    layers = list(map(_encode, shown))
+    while sum(len(layer) for layer in layers if layer) > budget and width > 16:
+        width = width * 3 // 4
+        layers = [_encode(None if one is None else _shrunk(one, width)) for one in shown]
+    return tuple(layers)
+
+
+def _grey(probability: NDArray[np.float32] | None, width: int) -> NDArray[np.uint8] | None:
+    """0 to 255: a long run has hundreds of them at a time."""
+    if probability is None:
+        return None
+    return _shrunk(np.rint(255 * probability).clip(0, 255).astype(np.uint8), width)
+
+
+def _shrunk(grey: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    height, before = grey.shape
+    shape = (width, max(round(width * height / before), 1))
+    return cv2.resize(grey, shape, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def _encode(grey: NDArray[np.uint8] | None) -> bytes | None:
+    if grey is None:
+        return None
+    image = Pillow.fromarray(np.rint(grey / 255 * (_STEPS - 1)).astype(np.uint8))
+    image.putpalette(_palette())
+    written = io.BytesIO()
+    transparency = bytes([0, *np.linspace(_FAINTEST, _STRONGEST, _STEPS - 1).astype(np.uint8)])
+    image.save(written, "PNG", bits=4, transparency=transparency, optimize=True)
+    return written.getvalue()
+
+
+def _palette() -> list[int]:
+    """Viridis, as the viewer has it."""
+    greys = np.rint(np.linspace(0, 255, _STEPS)).astype(np.uint8)[None]
+    return [int(value) for value in cv2.applyColorMap(greys, cv2.COLORMAP_VIRIDIS)[0, :, ::-1].ravel()]
+
+
+VIEWS = 48
+FPS = 12.0
+SIDE = 320
+PITCH = 20.0
+"""Degrees by which the views look down on the object."""
+
+
+def write_turntable(path: Path, model: ObjectModel, rotation: NDArray[np.float64]) -> None:
+    """Write one turn of the model about the vertical of a view; what was never seen is pale.
+
+    Args:
+        path: The MP4 file; it is there when it is whole.
+        model: The object.
+        rotation: ``(3, 3)`` object to camera of the first view.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    partial, texture = partial_path(path), texture_of_views(model, SIDE)
+    try:
+        with VideoWriter(partial, FPS, (SIDE, SIDE)) as video:
+            for yaw in report_each("turntable", np.arange(VIEWS) * 360.0 / VIEWS):
+                turned = Rotation.from_euler("yx", [yaw, PITCH], degrees=True).as_matrix() @ rotation
+                video.write(render_view(model, turned, SIDE, texture))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from typing import Any
 from tracking3d.report.figures import status_counts
 from tracking3d.report.frame_pictures import jpeg_of
 from tracking3d.report.rendering import render_page
-from tracking3d.report.run_report import write_report
+from tracking3d.report.run_report import write_report, write_turntable_of
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic
 from tracking3d.results.overlay import OverlaySize
@@ -53,3 +53,25 @@ def _card(folder: Path) -> dict[str, Any]:
         "counts": status_counts(run.frames),
         "picture": base64.b64encode(pictures[0]).decode("ascii") if pictures else "",
     }
+
+
+def renew_report(folder: Path) -> list[Path]:
+    """Write the report and the turntable of a run again, as far as it has them.
+
+    Args:
+        folder: The run folder.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: If the run is damaged.
+        OutputError: If something cannot be written.
+    """
+    report, turntable = folder / layout.REPORT, folder / layout.TURNTABLE
+    written = [path for path in (report, turntable) if path.is_file()]
+    if report in written:
+        write_report(folder, turntable=turntable in written)
+    elif turntable in written:
+        write_turntable_of(folder)
+    return written

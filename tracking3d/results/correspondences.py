@@ -7,6 +7,9 @@ object is in front of it. Other things in front of the object are unknown to the
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -22,7 +25,7 @@ from tracking3d.points.ray_intersection import surface_under
 from tracking3d.rendering.surface_visibility import DEPTH_TOLERANCE, deepest_around
 from tracking3d.rendering.visibility import NEAR, rasterize
 from tracking3d.results.layout import OVERLAY
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, jsonable
 from tracking3d.results.run_reader import RunReader
 
 
@@ -261,3 +264,50 @@ def tracked_record(run: RunReader, frame: int) -> FrameRecord:
             f"The object was lost in frame {frame} of {run.folder}; choose a frame that was tracked."
         )
     return record
+
+
+def points_to_json(tracks: PointTracks) -> str:
+    """One JSON object with the fields of `PointTracks` as nested lists; NaN is null."""
+    return json.dumps(jsonable(vars(tracks)), allow_nan=False)
+
+
+COLUMNS = [
+    "frame",
+    "point",
+    "x",
+    "y",
+    "visible",
+    "on_object",
+    "uncertainty",
+    "measured",
+    "X",
+    "Y",
+    "Z",
+    "kind",
+]
+
+
+def points_to_csv(tracks: PointTracks) -> str:
+    """One row a frame and point, with the columns `COLUMNS`.
+
+    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty if they are unknown. ``kind`` says by
+    what a point is followed, see `PointKind`.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    places = [[_number(value, 5) for value in point] for point in tracks.points]
+    for row, frame in enumerate(tracks.frames):
+        for point, (x, y) in enumerate(tracks.positions[row]):
+            flags = [int(tracks.visible[row, point]), int(tracks.on_object[point])]
+            unsure = _number(tracks.uncertainty[row, point], 3)
+            place = [_number(x, 3), _number(y, 3)]
+            measured = int(tracks.measured[row, point])
+            table.writerow(
+                [int(frame), point, *place, *flags, unsure, measured, *places[point], tracks.kind[point]]
+            )
+    return text.getvalue()
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if value == value else ""

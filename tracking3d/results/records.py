@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.rigid import nearest_rigid
 from tracking3d.runtime.stage_times import StageTimes
 
 _KINDS: dict[str, Any] = {

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import Assessment, FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
@@ -15,16 +16,17 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import pixels
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.lens import COUNTS, Lens
 from tracking3d.results import layout
-from tracking3d.results.camera_record import camera_from_record
+from tracking3d.results.description import is_gone
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
 from tracking3d.results.probabilities import read_probability
-from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
 from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import StageTimes
+from tracking3d.video import FrameSource, open_source
 
 if TYPE_CHECKING:
     import trimesh
@@ -356,3 +358,72 @@ def _read_description(folder: Path) -> dict[str, Any]:
         if name in description and not isinstance(description[name], kind):
             raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     return description
+
+
+def camera_from_record(record: Mapping[str, Any]) -> Camera:
+    """The camera that ``dataclasses.asdict`` made a mapping of.
+
+    Raises:
+        TypeError: If a key is missing or unknown.
+        ValueError: If the lens is none that can be; says why.
+    """
+    lens = record.get("lens")
+    return Camera(**{**record, "lens": None if lens is None else _read_lens(lens, record)})
+
+
+def _read_lens(lens: Any, camera: Mapping[str, Any]) -> Lens:
+    if not isinstance(lens, Mapping):
+        raise ValueError(f"lens is {lens!r:.40}")
+    model = lens.get("model")
+    if model not in COUNTS:
+        raise ValueError(f"the lens has the unknown model {model!r:.40}")
+    coefficients = _numbers(lens, "coefficients", COUNTS[model])
+    picture, pinhole = (_numbers(lens, name, (4,)) for name in ("picture", "pinhole"))
+    if not min(*picture[:2], *pinhole[:2]) > 0:
+        raise ValueError("the lens has no focal length")
+    if (lens.get("width"), lens.get("height")) != (camera.get("width"), camera.get("height")):
+        raise ValueError("the lens belongs to images of another size")
+    return Lens(model, coefficients, picture, pinhole, lens["width"], lens["height"])
+
+
+def _numbers(lens: Mapping[str, Any], name: str, counts: tuple[int, ...]) -> tuple[Any, ...]:
+    values = lens.get(name)
+    if not isinstance(values, list | tuple) or len(values) not in counts:
+        raise ValueError(f"{name} of the lens is {values!r:.40}")
+    if not all(isinstance(one, int | float) and math.isfinite(one) for one in values):
+        raise ValueError(f"{name} of the lens is {values!r:.40}")
+    return tuple(float(one) for one in values)
+
+
+def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSource:
+    """The video that a run was made on.
+
+    Args:
+        run: The run.
+        source: Its present path; if left out that in the run, from the present folder or from those above the run's.
+
+    Raises:
+        InputError: If it is not there.
+    """
+    named = source if source is not None else run.description.get("source")
+    if not isinstance(named, str | Path) or not str(named) or str(named).isdigit():
+        raise InputError(f"The video of the run {run.folder} cannot be read again; give it as --source.")
+    places = [Path(named)] if source is not None else places_of(str(named), run.folder)
+    there = next((place for place in places if place.exists()), named)
+    try:
+        return open_source(str(there), run.description.get("selection"))
+    except InputError as error:
+        raise InputError(
+            f"The video of the run {run.folder} cannot be read ({str(error).rstrip('.')}); give its path as --source."
+        ) from error
+
+
+def places_of(source: str, folder: Path) -> list[Path]:
+    """Candidate paths of a run's video: its path was relative to the working directory of the run.
+
+    Args:
+        source: What ``run.json`` calls it.
+        folder: The run folder.
+    """
+    name = Path(source).expanduser()
+    return [name] if name.is_absolute() else [name, *(above / name for above in folder.resolve().parents)]

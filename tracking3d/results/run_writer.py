@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.artefacts import check_complete
 from tracking3d.results.files import (
     first_problem,
     read_mask,
@@ -29,8 +31,7 @@ from tracking3d.results.files import (
     write_reserved,
     writing,
 )
-from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
-from tracking3d.results.initial_masks import write_initial_mask
+from tracking3d.results.lock import try_lock
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.overwrite import check_output_folder, clear_run_folder
@@ -39,7 +40,7 @@ from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.results.visible_masks import write_visible_masks
+from tracking3d.results.visible_masks import expect_visible_masks, write_visible_masks
 from tracking3d.runtime.regular_work import RegularWork
 
 FinalState = Literal["finished", "interrupted", "failed"]
@@ -362,3 +363,164 @@ class RunWriter:
         """Counts and times of the run so far."""
         skipped = len(self._description["skipped"])
         return description.summary(latest(records), skipped, self.seconds, latest(records, refined=False))
+
+
+PICTURES = (layout.OVERLAY, layout.CONTACT_SHEET)
+_SHOWN = (layout.RUN, layout.FRAMES, *PICTURES, *layout.MESH_FILES)
+
+
+def missing_files(folder: Path, names: Iterable[str]) -> list[str]:
+    """Those of some files in a folder that are not there, or empty."""
+    return [name for name in names if not _is_there(folder / name)]
+
+
+def check_complete(folder: Path, *, mesh: bool, pictures: bool) -> None:
+    """Make sure that a run that ends as finished has its files.
+
+    Args:
+        folder: The run folder.
+        mesh: Whether it has a mesh.
+        pictures: Whether a frame was drawn.
+
+    Raises:
+        OutputError: If one is missing.
+    """
+    names = [*(layout.MESH_FILES if mesh else ()), *(PICTURES if pictures else ())]
+    if missing := missing_files(folder, names):
+        verb = "is" if len(missing) == 1 else "are"
+        raise OutputError(
+            f"{', '.join(missing)} {verb} missing in {folder}, so that the run is not finished; resume it."
+        )
+
+
+def lacks_report(folder: Path) -> bool:
+    """Whether a run has no report, or no turntable though it has a model."""
+    model = (folder / layout.FEATURES).is_file()
+    return bool(missing_files(folder, (layout.REPORT, *([layout.TURNTABLE] if model else []))))
+
+
+def times_written(folder: Path) -> tuple[int, ...]:
+    """When the files were written that a report shows; if one of them changes, the report is out of date."""
+    paths = [folder / name for name in _SHOWN]
+    return tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in paths)
+
+
+def _is_there(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+# The mask tracker's masks in a run folder, ``initial_masks/``, and what it says is in front of the object.
+#
+# One PNG a frame: 255 the object, 64 an occluder, 0 the rest.
+
+
+def write_initial_mask(
+    folder: Path, index: int, mask: NDArray[np.bool_], occluder: NDArray[np.bool_] | None
+) -> None:
+    """Write what a mask tracker gave for frame ``index``.
+
+    Args:
+        folder: The run folder.
+        index: Index of the frame.
+        mask: ``(H, W)``.
+        occluder: ``(H, W)`` what is in front of the object; None if nothing is known.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    if occluder is not None and occluder.any():
+        expect_visible_masks(folder)
+    write_mask(layout.initial_mask_path(folder, index), mask, occluder)
+
+
+def is_initial_mask(folder: Path, frame: Frame, estimate: MaskEstimate) -> bool:
+    """Whether a mask tracker's estimate for a frame is the one that the run folder holds."""
+    kept, given = read_mask(layout.initial_mask_path(folder, frame.index)), estimate.binary
+    if kept is None or given is None:
+        return all(mask is None or not mask.any() for mask in (kept, given))
+    return np.array_equal(kept, given)
+
+
+@dataclass(frozen=True)
+class WrittenSoFar:
+    """What a stopped run has written."""
+
+    lines: int = 0  # bytes of frames.jsonl that are of finished frames
+    seconds: float = 0.0  # wall time of the run until then
+    skipped: tuple[SkippedFrame, ...] = ()  # frames that were not taken
+
+
+class FrameLines:
+    """Appends records to ``frames.jsonl``, and holds a lock on it that the system drops with the process.
+
+    Args:
+        folder: The run folder; it exists.
+
+    Raises:
+        OutputError: If another run writes there, or the file cannot be opened.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / layout.FRAMES
+        self._kept: int | None = None
+        with writing(folder):
+            self._new = not self._path.exists()
+            self._file = self._path.open("ab", buffering=0)
+        if not try_lock(self._file.fileno()):
+            self._file.close()
+            raise OutputError(
+                f"{folder} is in use by another run; wait for it or choose another {layout.OUT}."
+            )
+
+    @property
+    def size(self) -> int:
+        """Bytes of finished frames."""
+        return self._file.seek(0, 2) if self._kept is None else self._kept
+
+    def begin(self) -> None:
+        """Begin with none."""
+        self._file.truncate(0)
+
+    def go_on(self, kept: int) -> None:
+        """Continue behind ``kept`` bytes; later lines stay until others are written in their place.
+
+        Raises:
+            OutputError: If the file is shorter.
+        """
+        if self._file.seek(0, 2) < kept:
+            raise OutputError(f"{self._path} is shorter than it was; run it again with {layout.OVERWRITE}.")
+        self._kept = kept
+
+    def append(self, records: Sequence[FrameRecord]) -> None:
+        """Append the lines of all records, or none of them.
+
+        Raises:
+            OutputError: If they cannot be written.
+        """
+        lines = b"".join(record.to_json().encode() + b"\n" for record in records)
+        with writing(self._path):
+            self.truncate()
+            end = self._file.seek(0, 2)
+            try:
+                written = 0
+                while written < len(lines):
+                    written += self._file.write(lines[written:])
+            except OSError:
+                self._file.truncate(end)
+                raise
+
+    def truncate(self) -> None:
+        """Cut off the lines that a stopped run wrote after its last finished frame."""
+        if self._kept is not None:
+            self._file.truncate(self._kept)
+            self._kept = None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Close the file, and remove it if it was made here."""
+        self.close()
+        if self._new:
+            self._path.unlink()

@@ -18,6 +18,8 @@ _ROOMS = {"benchmark", "datasets", "evaluation", "speed", "synthesis", "vot"}
 """Of the package, whose modules are in ``tracking3d_bench`` now."""
 
 _ELSEWHERE = {
+    "tracking3d.config.solvers": "tracking3d.config.models",
+    "tracking3d.points.answers": "tracking3d.points.online",
     "tracking3d.datasets.region_files": "tracking3d.trackers.region_files",
     "tracking3d.datasets.region_tracker": "tracking3d.trackers.region_tracker",
     "tracking3d.speed.kernels_ahead": "tracking3d.runtime.kernels_ahead",
@@ -44,7 +46,7 @@ class MovedModules:
         """Where a former name leads; None for every other name."""
         package, _, inside = fullname.partition(".")
         room = inside.partition(".")[0]
-        if package != "tracking3d" or room not in _ROOMS:
+        if package != "tracking3d" or (room not in _ROOMS and fullname not in _ELSEWHERE):
             return None
         if inside == room and room != "vot":
             return ModuleSpec(fullname, _FormerRoom(), is_package=True)  # type: ignore[arg-type]

@@ -7,8 +7,9 @@ time telling which motion it has.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +19,13 @@ from numpy.typing import NDArray
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.concurrency import OrderedExecutor
-from tracking3d.segmentation.colour_models import ColourModels, as_lab
+from tracking3d.segmentation.colour_models import (
+    ColourModels,
+    as_lab,
+    beside_outline,
+    outline_difference,
+    relative_distance,
+)
 from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement, smoothing_of
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
@@ -26,8 +33,7 @@ from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
-from tracking3d.segmentation.whole_video_features import PixelEvidence
-from tracking3d.segmentation.whole_video_weights import WEIGHTS
+from tracking3d.trackers.outline import inside_distance
 
 _LEAST_CONFIDENCE = 0.5
 """Of the frames that are combined; all if none has it."""
@@ -227,3 +233,226 @@ def segment_all(
     for frame in frames:
         yield from hindsight.decide(frame)
     yield from hindsight.rest()
+
+
+_ON, _OFF = 1.0, (3.0, 9.0)
+"""Pixels from the outline within which an edge is on it, and between which it is beside it."""
+_NEIGHBOURHOOD = 0.15  # half its side, relative to the root of the area
+_MOST = 1.5
+
+
+def edge_strength(lab: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(S, S)`` how much the colours of a crop ``(S, S, 3)`` in 8-bit Lab change at each pixel, as a root."""
+    smooth = cv2.GaussianBlur(lab, (0, 0), 0.8).astype(np.float32)
+    total = np.zeros(lab.shape[:2], np.float32)
+    for channel in range(3):
+        plane = np.ascontiguousarray(smooth[..., channel])
+        total += cv2.Sobel(plane, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(plane, cv2.CV_32F, 0, 1) ** 2
+    strength = np.sqrt(total)
+    return np.asarray(np.sqrt(strength / max(float(strength.mean()), 1e-6)), np.float32)
+
+
+def alignment(edges: NDArray[np.float32], distance: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """Log of how strong edges are on an outline over how strong they are beside it.
+
+    Args:
+        edges: ``(S, S)`` from `edge_strength`.
+        distance: ``(S, S)`` pixels to the outline, positive inside.
+
+    Returns:
+        ``(S, S)`` around each pixel, within 1.5, and of the whole outline; 0 if there is no outline.
+    """
+    area = int(np.count_nonzero(distance > 0))
+    if area in (0, distance.size):
+        return np.zeros_like(distance), 0.0
+    distance = np.abs(distance)
+    on, off = (
+        (distance <= _ON).astype(np.float32),
+        ((distance >= _OFF[0]) & (distance <= _OFF[1])).astype(np.float32),
+    )
+    side = (2 * max(round(_NEIGHBOURHOOD * math.sqrt(area)), 2) + 1,) * 2
+    floor = 0.05
+    sums = [cv2.blur(plane, side) for plane in (edges * on, on, edges * off, off)]
+    tiny = 1e-4
+    known = np.minimum(sums[1] / 0.01, 1.0)
+    local = known * np.log((sums[0] / (sums[1] + tiny) + floor) / (sums[2] / (sums[3] + tiny) + floor))
+    whole = math.log(
+        (float((edges * on).sum()) / max(float(on.sum()), 1) + floor)
+        / (float((edges * off).sum()) / max(float(off.sum()), 1) + floor)
+    )
+    return np.clip(local, -_MOST, _MOST).astype(np.float32), whole
+
+
+# The features of each pixel once all frames are known: shapes, colours, motion, and how far each can be trusted.
+#
+# Every source is odd: without it, or where it cannot tell, it is 0, and what speaks for the object is positive. There
+# is no constant, which would say that masks are too large or too small as those of some tracker are.
+
+_DEEP, _NEAR, _AT_OUTLINE, _MOST_LOG_ODDS = 0.25, 0.08, 0.02, 1.5
+_BESIDE = 0.15
+_APART = 0.03
+_SCALE_OF_LOGS, _SCALE_OF_MOTION = 3.0, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class PixelEvidence:
+    """What the sources say in one frame."""
+
+    # (S, S) signed distances, positive inside, over the root of the area, by whose outline it is: initial,
+    # answer, drawn and the hulls hull and wide hull; absent if there is none
+    distances: Mapping[str, Plane]
+    # how well each lies on edges, around each pixel (S, S) and on the whole
+    alignments: Mapping[str, tuple[Plane, float]]
+    colours: Plane  # (2, S, S) beside the outline, and remembered
+    motion: Plane  # (2, S, S)
+    confidence: float  # the confidence of the pose
+
+    @classmethod
+    def of(
+        cls, scene: FrameWindow, hulls: Plane | None, colours: ColourModels | None, motion: Plane
+    ) -> PixelEvidence:
+        """Ask all of them.
+
+        Args:
+            scene: The frame.
+            hulls: ``(2, S, S)`` from `tracking3d.segmentation.soft_visual_hull.SoftVisualHull.drawn`, or None.
+            colours: What all frames that are trusted show, or None.
+            motion: From `tracking3d.segmentation.motion_cue.motion_cue`.
+        """
+        lab = as_lab(scene.image)
+        masks = {"initial": scene.initial, "answer": scene.answer}
+        masks |= {"drawn": scene.drawn} if scene.drawn.any() else {}
+        outlines = {name: inside_distance(mask) for name, mask in masks.items()}
+        distances = {name: relative_distance(mask, outlines[name]) for name, mask in masks.items()}
+        if hulls is not None:
+            root = math.sqrt(max(int(np.count_nonzero(scene.answer)), 1))
+            named = dict(zip(("hull", "wide hull"), hulls, strict=True))
+            distances |= {name: hull / root for name, hull in named.items()}
+            outlines |= {name: inside_distance(hull > 0) for name, hull in named.items()}
+        edges = edge_strength(lab)
+        alignments = {name: alignment(edges, outline) for name, outline in outlines.items()}
+        nearby = beside_outline(lab, scene.answer) if scene.answer.any() else np.zeros_like(edges)
+        remembered = np.zeros_like(edges) if colours is None else colours.log_ratio(lab)
+        return cls(distances, alignments, np.stack([nearby, remembered]), motion, scene.confidence)
+
+    @property
+    def in_reach(self) -> NDArray[np.bool_]:
+        """``(S, S)``: what may be the object's."""
+        masks = [self.distances[name] for name in ("initial", "answer", "drawn") if name in self.distances]
+        return np.asarray(np.max(masks, 0) > -_BESIDE)
+
+    @property
+    def shape(self) -> Plane | None:
+        """``(S, S)`` distance to the outline of what surface and hull both contain; None if there are not both.
+
+        The hull has what enough frames show: a part that something hides in all of them is not made up.
+        """
+        if not {"drawn", "wide hull"} <= self.distances.keys():
+            return None
+        return np.minimum(self.distances["drawn"], self.distances["wide hull"])
+
+    def sources(self) -> Iterator[tuple[str, Plane]]:
+        """Each by name, ``(S, S)``."""
+        for plane, beliefs in self._terms():
+            yield from ((name, plane * belief) for name, belief in beliefs.items())
+
+    def log_odds(self, weights: Mapping[str, float]) -> Plane:
+        """``(S, S)`` log-odds of the object."""
+        total = np.zeros_like(self.colours[0])
+        for plane, beliefs in self._terms():
+            factors = [np.float32(weights[name]) * belief for name, belief in beliefs.items()]
+            total += sum(factors[1:], factors[0]) * plane
+        return np.where(self.in_reach, total, -6.0).astype(np.float32)
+
+    def _terms(self) -> Iterator[tuple[Plane, dict[str, np.float32 | Plane]]]:
+        """What is said, ``(S, S)``, and by source how far it is trusted: throughout, or ``(S, S)`` of each pixel."""
+        one, confidence, doubt = np.float32(1), np.float32(self.confidence), np.float32(self._doubt())
+        for name, distance in self.distances.items():
+            around, whole = self.alignments[name]
+            beliefs: dict[str, np.float32 | Plane] = {
+                "": one,
+                " on edges": np.clip(around, -1, 1),
+                " on edges as a whole": np.float32(np.clip(whole, -0.5, 1.5)),
+            }
+            beliefs |= {" by doubt": doubt} if name == "initial" else {" by confidence": confidence}
+            near, at = (
+                np.clip(distance / _NEAR, -_MOST_LOG_ODDS, _MOST_LOG_ODDS),
+                np.tanh(distance / _AT_OUTLINE),
+            )
+            yield near, {f"{name}, near{how}": belief for how, belief in beliefs.items()}
+            yield at, {f"{name}, at the outline{how}": belief for how, belief in beliefs.items()}
+            if name != "wide hull":
+                yield np.clip(distance / _DEEP, -_MOST_LOG_ODDS, _MOST_LOG_ODDS), {f"{name}, deep": one}
+        edges = np.float32(np.clip(self.alignments["initial"][1], -0.5, 1.5))
+        names = "colours beside the outline", "colours remembered"
+        for name, plane in zip(names, self.colours / _SCALE_OF_LOGS, strict=True):
+            yield plane, {name: one, f"{name} by doubt": doubt, f"{name} by the initial mask's edges": edges}
+        names = "motion of colours", "motion of fine texture"
+        for name, plane in zip(names, self.motion / _SCALE_OF_MOTION, strict=True):
+            yield plane, {name: one, f"{name} by doubt": doubt}
+
+    def _doubt(self) -> float:
+        """How far the initial mask's outline is from the drawn surface's, in [0, 2]."""
+        drawn = self.distances.get("drawn")
+        if drawn is None:
+            return 2.0
+        difference = outline_difference(self.distances["initial"], drawn)
+        return 2.0 if difference is None else min(difference / _APART, 2.0)
+
+
+WEIGHTS = {
+    "initial, near": 0.145,
+    "initial, at the outline": 1.145,
+    "initial, near on edges": -0.105,
+    "initial, at the outline on edges": 0.254,
+    "initial, near on edges as a whole": -0.510,
+    "initial, at the outline on edges as a whole": -0.142,
+    "initial, deep": 0.230,
+    "answer, near": -0.238,
+    "answer, at the outline": -0.004,
+    "answer, near on edges": 0.168,
+    "answer, at the outline on edges": 0.545,
+    "answer, near on edges as a whole": -0.207,
+    "answer, at the outline on edges as a whole": 0.033,
+    "answer, near by confidence": 0.703,
+    "answer, at the outline by confidence": 0.571,
+    "answer, deep": -0.470,
+    "drawn, near": 0.178,
+    "drawn, at the outline": 0.141,
+    "drawn, near on edges": -0.100,
+    "drawn, at the outline on edges": 0.194,
+    "drawn, near on edges as a whole": 0.129,
+    "drawn, at the outline on edges as a whole": 0.149,
+    "drawn, near by confidence": -0.461,
+    "drawn, at the outline by confidence": -0.192,
+    "drawn, deep": 0.371,
+    "hull, near": -0.014,
+    "hull, at the outline": 0.046,
+    "hull, near on edges": 0.008,
+    "hull, at the outline on edges": 0.233,
+    "hull, near on edges as a whole": 0.276,
+    "hull, at the outline on edges as a whole": 0.209,
+    "hull, near by confidence": 0.157,
+    "hull, at the outline by confidence": 0.116,
+    "hull, deep": -0.122,
+    "wide hull, near": 0.355,
+    "wide hull, at the outline": 0.092,
+    "wide hull, near on edges": 0.084,
+    "wide hull, at the outline on edges": 0.331,
+    "wide hull, near on edges as a whole": 0.305,
+    "wide hull, at the outline on edges as a whole": 0.184,
+    "wide hull, near by confidence": -0.155,
+    "wide hull, at the outline by confidence": -0.321,
+    "initial, near by doubt": -0.221,
+    "initial, at the outline by doubt": 0.008,
+    "colours beside the outline": 1.071,
+    "colours beside the outline by doubt": 0.081,
+    "colours beside the outline by the initial mask's edges": 0.200,
+    "colours remembered": 0.675,
+    "colours remembered by doubt": 0.479,
+    "colours remembered by the initial mask's edges": -0.048,
+    "motion of colours": 0.788,
+    "motion of colours by doubt": 0.551,
+    "motion of fine texture": 0.697,
+    "motion of fine texture by doubt": 0.609,
+}

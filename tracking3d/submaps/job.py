@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tracking3d.config.models import PipelineConfig
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.submaps.cuts import parse_length
-from tracking3d.video.selection import parse_selection
-from tracking3d.video.source import FrameSource
+from tracking3d.video.source import FrameSource, parse_selection
 
 Tell = Callable[[Any], None]
 

@@ -21,10 +21,9 @@ from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.session import Session
 from tracking3d.results import layout
 from tracking3d.results.files import writing
-from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_writer import RunWriter
+from tracking3d.results.run_writer import FrameLines, RunWriter
 from tracking3d.submaps.cuts import Part
 
 

@@ -14,11 +14,10 @@ from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import SavedState
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import Frame
-from tracking3d.pipeline.frame_reading import read_timed
+from tracking3d.pipeline.frame_reading import SavedMasks, read_timed
 from tracking3d.pipeline.open_tracking import open_tracking, request_tracking
 from tracking3d.pipeline.record import RecordOptions, record_tracking
 from tracking3d.pipeline.refinement_steps import Retracking
-from tracking3d.pipeline.saved_masks import SavedMasks
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout

@@ -21,15 +21,22 @@ from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
-from tracking3d.trackers.colour_models import GlobalColours, Palette
+from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, crop_window, outside, paste_mask
+from tracking3d.trackers.crops import (
+    box_iou,
+    box_of,
+    clip_box,
+    crop_window,
+    inside_frame,
+    outside,
+    paste_mask,
+)
 from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.outline import both_sides, inside_distance, remove_specks, touches_border
-from tracking3d.trackers.search import find_by_colours
 
 SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
 """OpenCV contrib modules that the segmentation needs, see `tracking3d.trackers.opencv_build`."""
@@ -286,3 +293,63 @@ def _shift(last: Box | None, present: Box | None) -> tuple[int, int]:
     limit = max(last[2:])
     right, down = (present[i] + present[i + 2] / 2 - last[i] - last[i + 2] / 2 for i in (0, 1))
     return round(max(min(right, limit), -limit)), round(max(min(down, limit), -limit))
+
+
+_OVERVIEW = 160  # longer side in pixels of the image that is searched
+_UNCHANGED = 6.0  # log-odds, as many as colours can say, that what was there without the object is not it
+_LEAST_AREA, _MOST_AREA = (0.1, 2.5)  # of the object's usual area; while it comes in, only a part is seen
+
+
+def find_by_colours(
+    image: Image,
+    colours: GlobalColours,
+    area: float,
+    margin: float,
+    size: int,
+    unchanged: NDArray[np.float32] | None = None,
+) -> tuple[NDArray[np.bool_], Window, float] | None:
+    """Segment what looks most like the object.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 RGB.
+        colours: What is known of the object.
+        area: Its usual area in pixels of the frame.
+        margin: Free space around it in the crop, relative to its size.
+        size: Side of the crop in pixels.
+        unchanged: ``(H, W)`` in [0, 1] how surely a pixel is what was seen of the background there, or None.
+
+    Returns:
+        The mask ``(size, size)`` in a window, the window, and how well its colours tell it from its surroundings,
+        in [-1, 1]; None if nothing of a possible size has such colours.
+    """
+    scale = min(_OVERVIEW / max(image.shape[:2]), 1.0)
+    overview = lab(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    likeness = np.tanh(colours.rarity(overview, overview))
+    known = np.zeros(image.shape[:2], np.float32) if unchanged is None else unchanged
+    known_overview = cv2.resize(known, overview.shape[1::-1], interpolation=cv2.INTER_AREA)
+    likeness = np.minimum(likeness, 1 - 2 * known_overview)
+    blurred = cv2.GaussianBlur(likeness, (0, 0), max(math.sqrt(area) * scale, 3.0) / 3)
+    row, column = np.unravel_index(int(np.argmax(blurred)), blurred.shape)
+    side = 1.3 * math.sqrt(area)
+    left, top = ((at + 0.5) / scale - side / 2 for at in (column, row))
+    window = Window.around((left, top, side, side), margin, size)
+
+    crop, in_frame = crop_window(image, window), inside_frame(image.shape, window)
+    rows, columns = np.mgrid[:size, :size] + 0.5 - size / 2
+    evidence = 2 * colours.rarity(lab(crop), overview) + 1 - np.hypot(rows, columns) / (0.3 * size)
+    evidence -= _UNCHANGED * crop_window(known, window)
+    support = np.tanh(evidence / 3).astype(np.float32)
+    smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop, support, 100.0, 12.0)
+    found = (smooth > 0) & in_frame
+    mask = _largest(remove_specks(found, found))
+    if not _LEAST_AREA * area <= np.count_nonzero(mask) / window.scale**2 <= _MOST_AREA * area:
+        return None
+    inside, around = both_sides(mask)
+    return mask, window, colours.separation(lab(crop), inside, around & in_frame)
+
+
+def _largest(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    stats[0, cv2.CC_STAT_AREA] = 0
+    largest = int(np.argmax(stats[:, cv2.CC_STAT_AREA]))
+    return mask & (labels == largest)

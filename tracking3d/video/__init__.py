@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     from tracking3d.video.image_file import read_image
     from tracking3d.video.latest_frames import LatestFrames
     from tracking3d.video.opening import open_source
-    from tracking3d.video.selection import natural_order, parse_selection
-    from tracking3d.video.source import FrameSource, Intrinsics
+    from tracking3d.video.source import FrameSource, Intrinsics, natural_order, parse_selection
     from tracking3d.video.writer import VideoWriter
 
 __all__ = [
@@ -30,9 +29,9 @@ _HOME = {
     "Intrinsics": "tracking3d.video.source",
     "LatestFrames": "tracking3d.video.latest_frames",
     "VideoWriter": "tracking3d.video.writer",
-    "natural_order": "tracking3d.video.selection",
+    "natural_order": "tracking3d.video.source",
     "open_source": "tracking3d.video.opening",
-    "parse_selection": "tracking3d.video.selection",
+    "parse_selection": "tracking3d.video.source",
     "read_image": "tracking3d.video.image_file",
 }
 

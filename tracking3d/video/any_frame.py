@@ -17,8 +17,7 @@ from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.picture_conversion import PictureConverter
-from tracking3d.video.selection import EVERY_FRAME
-from tracking3d.video.source import FrameSource
+from tracking3d.video.source import EVERY_FRAME, FrameSource
 from tracking3d.video.video_file import VideoFile, video_stream
 
 MOST_KEPT = 128 * 2**20

@@ -11,8 +11,7 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
-from tracking3d.video.selection import EVERY_FRAME, within
-from tracking3d.video.source import Intrinsics, check_frames
+from tracking3d.video.source import EVERY_FRAME, Intrinsics, check_frames, within
 
 
 @dataclass(frozen=True, eq=False)

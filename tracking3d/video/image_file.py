@@ -15,8 +15,7 @@ from PIL import UnidentifiedImageError
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Image
-from tracking3d.video.opencv_log import silent_opencv
-from tracking3d.video.orientation import UPRIGHT, turn_upright
+from tracking3d.video.picture_conversion import UPRIGHT, turn_upright
 from tracking3d.video.source import Intrinsics
 
 # fmt: off
@@ -143,3 +142,14 @@ def _read_deep(path: Path) -> Image:
     deep = deep if deep.ndim == 3 else deep[..., None]
     blue_green_red = deep[..., [0, 0, 0]] if deep.shape[2] < 3 else deep[..., :3]
     return ((blue_green_red[..., ::-1].astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+@contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Print nothing that OpenCV logs inside the ``with`` block, then set its log level back."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)

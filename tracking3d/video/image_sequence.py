@@ -11,8 +11,7 @@ from pathlib import Path
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video.image_file import SUFFIXES, mode_of, read_exif_intrinsics, read_image
-from tracking3d.video.selection import EVERY_FRAME, natural_order, within
-from tracking3d.video.source import Intrinsics, check_frames
+from tracking3d.video.source import EVERY_FRAME, Intrinsics, check_frames, natural_order, within
 
 
 def images_among(paths: Iterable[Path]) -> list[Path]:

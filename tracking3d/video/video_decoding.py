@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from fractions import Fraction
 
 import av
 from av.container import InputContainer
 from av.error import FFmpegError
+from av.filter import Graph
 from av.video.stream import VideoStream
-
-from tracking3d.video.codec_threads import codec_threads
 
 # These decoders leave out a picture whose references are lost, and say nothing.
 _SILENT_CODECS = ("h264", "hevc")
@@ -86,3 +88,95 @@ def _breaks_off(stream: VideoStream, packets: int, end: int) -> bool:
     if not (stream.duration and 0 < packets < stream.frames):
         return False
     return end - (stream.start_time or 0) < stream.duration * (1 - 1.5 / stream.frames)
+
+
+VARIABLE = "OMP_NUM_THREADS"
+"""Environment variable with the number of threads of libraries in a process."""
+
+
+def codec_threads() -> int:
+    """What the environment variable allows; 0, with which FFmpeg takes a thread for every core, without it."""
+    given = os.environ.get(VARIABLE, "")
+    return int(given) if given.isdecimal() and int(given) > 0 else 0
+
+
+FILTER = "bwdif"
+"""FFmpeg's filter of Bob Weaver and yadif, https://ffmpeg.org/ffmpeg-filters.html#bwdif"""
+
+
+def deinterlace(pictures: Iterable[av.VideoFrame | str]) -> Iterator[av.VideoFrame | str]:
+    """The same pictures in the same number and order, interlaced ones deinterlaced; progressive ones pass as they are.
+
+    The lines of a picture that are missing at its moment come from the pictures before and after it, so that each
+    is held until the next one is there. If one could not be decoded, which its reason stands for, they are not
+    looked for beyond it.
+    """
+    graph: _Deinterlacer | None = None
+    for picture in pictures:
+        if isinstance(picture, str) or not (picture.interlaced_frame or graph is not None):
+            if graph is not None:
+                yield from graph.finish()
+                graph = None
+            yield picture
+            continue
+        if graph is not None and not graph.takes(picture):
+            yield from graph.finish()
+            graph = None
+        graph = graph or _Deinterlacer(picture)
+        yield from graph.push(picture)
+    if graph is not None:
+        yield from graph.finish()
+
+
+class _Deinterlacer:
+    """The filter on pictures of one size and kind, from the first one on."""
+
+    def __init__(self, picture: av.VideoFrame) -> None:
+        self._kind = _kind(picture)
+        self._graph = Graph()
+        source = self._graph.add_buffer(
+            width=picture.width,
+            height=picture.height,
+            format=picture.format,
+            time_base=picture.time_base or Fraction(1, 25),
+        )
+        # One picture for one; those that say they are progressive are left alone.
+        filter_ = self._graph.add(FILTER, "mode=send_frame:deint=interlaced")
+        sink = self._graph.add("buffersink")
+        source.link_to(filter_)
+        filter_.link_to(sink)
+        self._graph.configure()
+        self._held: deque[av.VideoFrame] = deque()
+
+    def takes(self, picture: av.VideoFrame) -> bool:
+        """Whether the picture is of the same size and kind."""
+        return _kind(picture) == self._kind
+
+    def push(self, picture: av.VideoFrame) -> Iterator[av.VideoFrame]:
+        """Take one more; gives those that are done."""
+        self._held.append(picture)
+        self._graph.vpush(picture)
+        yield from self._done()
+
+    def finish(self) -> Iterator[av.VideoFrame]:
+        """There is none behind the last one."""
+        with suppress(FFmpegError):
+            self._graph.vpush(None)
+        yield from self._done()
+        yield from self._held  # what the filter kept to itself comes as it was
+
+    def _done(self) -> Iterator[av.VideoFrame]:
+        while self._held:
+            try:
+                done = self._graph.vpull()
+            except (FFmpegError, BlockingIOError, EOFError):
+                return
+            taken = self._held.popleft()
+            done.pts = taken.pts  # the filter counts in halves
+            if taken.time_base:
+                done.time_base = taken.time_base
+            yield done
+
+
+def _kind(picture: av.VideoFrame) -> tuple[int, int, str]:
+    return picture.width, picture.height, picture.format.name

@@ -15,11 +15,9 @@ from av.video.stream import VideoStream
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.deinterlacing import deinterlace
 from tracking3d.video.picture_conversion import PictureConverter, said_of
-from tracking3d.video.selection import EVERY_FRAME, within
-from tracking3d.video.source import Intrinsics, check_frames
-from tracking3d.video.video_decoding import decode_pictures
+from tracking3d.video.source import EVERY_FRAME, Intrinsics, check_frames, within
+from tracking3d.video.video_decoding import decode_pictures, deinterlace
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 
 from tracking3d.errors import OutputError
 from tracking3d.frames import Image
-from tracking3d.video.codec_threads import codec_threads
+from tracking3d.video.video_decoding import codec_threads
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 """Encoders by preference: x264, other H.264 encoders, and MPEG-4 part 2, which every FFmpeg has."""

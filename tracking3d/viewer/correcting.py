@@ -27,7 +27,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_mask
 from tracking3d.video import parse_selection
 from tracking3d.video.any_frame import FrameImages
-from tracking3d.video.selection import within
+from tracking3d.video.source import within
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.web.access import Access
 

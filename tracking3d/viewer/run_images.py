@@ -10,7 +10,7 @@ from pathlib import Path
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.results import layout
-from tracking3d.results.run_source import places_of
+from tracking3d.results.run_reader import places_of
 from tracking3d.video.any_frame import MOST_KEPT, FrameImages, VideoPictures, frame_images
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource, Intrinsics, source_notes

@@ -12,7 +12,7 @@ from tracking3d_sam import SamTracker
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.testing import check_tracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 
 onnx = pytest.importorskip("onnx")
 node, value, FLOAT = onnx.helper.make_node, onnx.helper.make_tensor_value_info, onnx.TensorProto.FLOAT

@@ -16,7 +16,7 @@ from tracking3d_sam2 import Sam2Tracker
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.testing import check_tracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 
 MEAN, DEVIATION = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])
 

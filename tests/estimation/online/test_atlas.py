@@ -15,17 +15,15 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
 from tracking3d.estimation.online.atlas.atlas import (
     activate_largest_map,
+    colours_match,
     guess_alignment,
+    is_fully_visible,
     map_of_frame,
     mark_unaligned,
-    refine_inactive_map,
-    switch_map,
-)
-from tracking3d.estimation.online.atlas.reinitialization import (
-    colours_match,
-    is_fully_visible,
     masks_overlap,
     needs_second_map,
+    refine_inactive_map,
+    switch_map,
 )
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.solver import OnlineSolver

@@ -10,7 +10,7 @@ import pytest
 from online_runs import FRAMES, Run, estimate_of, final, frame, rotation_errors, true_mask
 from online_runs import solver as waiting_solver
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.online import map_initialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap

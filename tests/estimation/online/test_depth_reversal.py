@@ -13,9 +13,9 @@ from solid_points import map_with_points
 from tracked_solids import scene
 from turned_solid import CAMERA, SIZE, degrees_apart
 
+from tracking3d.bundle_adjustment.adjustment import reversal_of
 from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
-from tracking3d.bundle_adjustment.reversal import reversal_of
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping import depth_reversal as online_reversal
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal

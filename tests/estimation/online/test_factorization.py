@@ -10,7 +10,7 @@ from tracked_solids import degrees_between, intrinsics, scene
 
 from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
-from tracking3d.estimation.online.initialization.factorization import (
+from tracking3d.estimation.online.initialization.structure_from_motion import (
     affine_motion,
     align_with_axis,
     assumed_relief,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from turned_solid import CAMERA, turned_map
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping import global_refinement
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost, refine_globally
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about

@@ -10,7 +10,7 @@ import pytest
 from online_runs import Run, estimate_of, final
 from online_runs import solver as small_solver
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online import first_estimates, map_initialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import try_initialize

@@ -11,7 +11,7 @@ from patterns import disc, moved, shift, speckle, warped
 from solid_points import map_with_points
 from turned_solid import CAMERA, SIZE, turned, turned_map
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow
 from tracking3d.estimation.online.initialization import initializer

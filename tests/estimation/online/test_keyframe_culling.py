@@ -9,7 +9,7 @@ from turned_solid import degrees_apart, turned, turned_map
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
-from tracking3d.estimation.online.mapping.keyframe_culling import cull_keyframes, prune_landmarks
+from tracking3d.estimation.online.mapping.keyframe_insertion import cull_keyframes, prune_landmarks
 
 VIEW = turned_map([0.0]).keyframes[0]
 

@@ -18,7 +18,7 @@ from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
+from tracking3d.estimation.online.tracking.pose_tracking import resect_pose
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from online_runs import FRAMES, solver, true_mask, turning_clip
 
-from tracking3d.config.models import PipelineConfig
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online import map_initialization
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -24,10 +23,8 @@ from tracking3d.pipeline.track import track
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.array_source import ArraySource
 from tracking3d.video.latest_frames import LatestFrames
-from tracking3d.video.live_camera import LiveCamera
-from tracking3d.video.selection import EVERY_FRAME
-from tracking3d.video.source import is_live
-from tracking3d.video.stream import LiveStream
+from tracking3d.video.opening import LiveCamera, LiveStream
+from tracking3d.video.source import EVERY_FRAME, is_live
 
 PATIENCE = 120.0
 """Seconds until a test fails because a thread hangs."""

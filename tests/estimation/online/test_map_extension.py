@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from online_runs import FRAMES, Run, estimate_of, frame, run, solver, true_mask, turning_clip, with_true_masks
 
-from tracking3d.estimation.gap import Gap
 from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
+from tracking3d.estimation.solver import Gap
 from tracking3d.geometry.pose import rotation_angle
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

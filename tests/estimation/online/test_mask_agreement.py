@@ -10,7 +10,7 @@ from online_runs import FRAMES, estimate_of, known_run, true_mask, turning_clip,
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.online.masks.mask_agreement import (
+from tracking3d.estimation.online.masks.frame_estimates import (
     initial_mask_weight,
     mask_agreement,
     measure_mask_agreement,

@@ -9,8 +9,7 @@ import pytest
 import torch
 from rendered_solids import observed, pose_of, shape_of, surface_of
 
-from tracking3d.estimation.online.optimization.observability import least_constrained_axis
-from tracking3d.estimation.online.optimization.pose_refinement import refine_pose
+from tracking3d.estimation.online.optimization.pose_refinement import least_constrained_axis, refine_pose
 from tracking3d.geometry.pose import from_matrix, rotation_about
 
 ROUND = surface_of(shape_of((0.6, 0.9, 0.6)))

@@ -24,9 +24,8 @@ from online_runs import (
 
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import MOTION_RATIO, MOVES, Status
 from tracking3d.estimation.solver import RefiningSolver
-from tracking3d.estimation.tracker_feedback import MOTION_RATIO, MOVES
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline.track import track
 from tracking3d_bench.evaluation.metrics import mask_iou

@@ -7,7 +7,7 @@ import pytest
 from tracked_solids import degrees_between, scene
 
 from tracking3d.bundle_adjustment.adjustment import Tracks
-from tracking3d.estimation.online.initialization.planar import (
+from tracking3d.estimation.online.initialization.structure_from_motion import (
     _fit_plane_structure,
     is_planar,
     planar_structures,

@@ -12,7 +12,7 @@ from twins import bundle_adjustment, pose_from_points
 
 from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, System, adjust
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
-from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
+from tracking3d.rendering.kernels.compilation import get_num_threads, set_num_threads
 
 SCENES = {
     "a few points": {"frames": 4, "count": 9, "noise": 0.5},

@@ -10,13 +10,11 @@ from turned_solid import CAMERA, SIZE, degrees_apart, turned_map
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.initialization import initial_map
 from tracking3d.estimation.online.initialization.initial_map import (
-    initialize_without_points,
-    restart_without_points,
-)
-from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
     PROFILES,
     TURN,
+    initialize_without_points,
+    restart_without_points,
     reverse_rotations,
     rotation_hypotheses,
     vary_rotations,

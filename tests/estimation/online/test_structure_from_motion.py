@@ -10,9 +10,9 @@ import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
 from tracking3d.bundle_adjustment.adjustment import Tracks, adjust
-from tracking3d.estimation.online.initialization.registration import register_all
 from tracking3d.estimation.online.initialization.structure_from_motion import (
     image_deformation,
+    register_all,
     structure_hypotheses,
 )
 

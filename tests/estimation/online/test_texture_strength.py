@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from patterns import disc, speckle
 
-from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
+from tracking3d.estimation.online.features.klt import PLAIN, texture_strength
 
 SIZE = (200, 240)
 MASK = disc(SIZE, (110, 100), 60)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_mask, whole_run
 
-from tracking3d.estimation.estimate import MaskSource, Status
+from tracking3d.estimation.estimate import RELOCALIZED, MaskSource, Status, corrects
 from tracking3d.estimation.online.features.klt import grey
-from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
-from tracking3d.estimation.tracker_feedback import RELOCALIZED, corrects
+from tracking3d.estimation.online.relocalization.pose_search import overlaps_mask, relocalize_in_frame
 from tracking3d.frames import Frame
 from tracking3d_bench.evaluation.metrics import mask_iou
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tracking3d.frames import MaskEstimate
-from tracking3d.trackers.onnx.schedule import NetworkSchedule
+from tracking3d.trackers.onnx.tracker import NetworkSchedule
 
 BOX = (20.0, 20.0, 40.0, 30.0)
 

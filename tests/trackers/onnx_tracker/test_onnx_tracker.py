@@ -16,9 +16,9 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, MaskEstimate, Prompt
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.testing import check_tracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 from tracking3d.trackers.crops import box_of
-from tracking3d.trackers.onnx import proposals
+from tracking3d.trackers.onnx import images
 from tracking3d.trackers.onnx import tracker as tracker_module
 from tracking3d.trackers.onnx.boxes import NetworkBoxes
 from tracking3d.trackers.onnx.tracker import OnnxTracker
@@ -226,7 +226,7 @@ def test_a_mask_that_cannot_be_used_leaves_the_carried_one_with_a_low_score(
         if last is None:
             return original(image, box, last)
         masks = [broken(proposal.mask) for proposal in original(image, box, last)]
-        return [proposals.Proposal(mask, proposals.sharpness(mask), "spoilt") for mask in masks]
+        return [images.Proposal(mask, images.sharpness(mask), "spoilt") for mask in masks]
 
     monkeypatch.setattr(tracker._segmenter, "propose", spoilt)
     estimates = track(tracker, disc)
@@ -269,7 +269,7 @@ def test_of_several_crops_the_mask_that_fits_the_colours_is_chosen(saliency, dis
         x, y, width, height = (int(value) for value in box)
         filled = np.zeros(image.shape[:2], np.float32)
         filled[max(y, 0) : y + height, max(x, 0) : x + width] = 1.0  # agrees with the box, and is sharp
-        return [proposals.Proposal(filled, 1.0, "box"), *good]
+        return [images.Proposal(filled, 1.0, "box"), *good]
 
     monkeypatch.setattr(tracker._segmenter, "propose", with_a_worse_one)
     assert min(ious(track(tracker, disc), disc[1])) > 0.9
@@ -412,12 +412,12 @@ class ScriptedSegmenter:
     def __init__(self, *masks: np.ndarray) -> None:
         self.masks, self.given = masks, []
 
-    def propose(self, image: np.ndarray, box: Box, last: np.ndarray | None) -> list[proposals.Proposal]:
-        return [proposals.Proposal(mask.astype(np.float32), 1.0, "box") for mask in self.masks]
+    def propose(self, image: np.ndarray, box: Box, last: np.ndarray | None) -> list[images.Proposal]:
+        return [images.Proposal(mask.astype(np.float32), 1.0, "box") for mask in self.masks]
 
-    def propose_by_points(self, image: np.ndarray, points: np.ndarray) -> list[proposals.Proposal]:
+    def propose_by_points(self, image: np.ndarray, points: np.ndarray) -> list[images.Proposal]:
         self.given.append(points)
-        return [proposals.Proposal(mask.astype(np.float32), 1.0, "points") for mask in self.masks]
+        return [images.Proposal(mask.astype(np.float32), 1.0, "points") for mask in self.masks]
 
 
 def test_a_network_that_takes_points_makes_the_first_mask_of_them(disc, saliency, monkeypatch):

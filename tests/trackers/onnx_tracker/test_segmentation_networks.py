@@ -10,10 +10,17 @@ from small_networks import SIDE, decoder, encoder, saliency_network
 
 from tracking3d.errors import InputError
 from tracking3d.trackers.onnx.description import Decoder, ImageInput, PromptableNetwork, SaliencyNetwork
-from tracking3d.trackers.onnx.images import enlarge, fit_image, network_input, on_image, sigmoid
+from tracking3d.trackers.onnx.images import (
+    Proposal,
+    enlarge,
+    fit_image,
+    network_input,
+    on_image,
+    sharpness,
+    sigmoid,
+)
 from tracking3d.trackers.onnx.judging import ColourJudge, background_points
 from tracking3d.trackers.onnx.promptable import PromptableSegmenter
-from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 from tracking3d.trackers.onnx.saliency import SaliencySegmenter
 
 BOX = (30.0, 20.0, 40.0, 25.0)

@@ -11,8 +11,7 @@ from small_networks import nano3_networks, nano_networks, saliency_network
 from tracking3d.errors import InputError
 from tracking3d.testing import check_tracker
 from tracking3d.trackers.crops import box_iou
-from tracking3d.trackers.onnx.boxes import NetworkBoxes, nano_boxes
-from tracking3d.trackers.onnx.siamese_boxes import SiameseBoxes
+from tracking3d.trackers.onnx.boxes import NetworkBoxes, SiameseBoxes, nano_boxes
 from tracking3d.trackers.onnx.tracker import OnnxTracker
 
 SIDE = 48

@@ -12,14 +12,13 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.results.files import read_mask
 from tracking3d.testing import check_tracker
-from tracking3d.testing.clips import moving_disc
+from tracking3d.testing.trackers import moving_disc
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
-from tracking3d.trackers.segment.cue import NetworkCue, _settle
 from tracking3d.trackers.segment.network import ObjectNetwork
-from tracking3d.trackers.segment.tracker import SegmentTracker
+from tracking3d.trackers.segment.tracker import NetworkCue, SegmentTracker, _settle
 from tracking3d.video.image_file import read_image
 from tracking3d_bench.benchmark.mask_trackers import Contestant, measure_trackers
 from tracking3d_bench.benchmark.sequences import open_dataset

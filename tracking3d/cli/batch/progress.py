@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from tracking3d.batch.folder import BatchProgress as HowFar
-from tracking3d.cli.remaining_time import duration_in_words
+from tracking3d.cli.progress import duration_in_words
 
 if TYPE_CHECKING:
     from tracking3d.batch.running import Happening, Listener

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, configure, grouped, numbers
-from tracking3d.cli.options.general import Sequences
-from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
-from tracking3d.cli.options.performance import Address
+from tracking3d.cli.options.general import DATA, OUTPUT, PERFORMANCE, Sequences
+from tracking3d.cli.options.output import Address
 from tracking3d.cli.options.prompt import BoxFormat
 from tracking3d.errors import InputError
 

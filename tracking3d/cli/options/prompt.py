@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options.panels import PROMPT
+from tracking3d.cli.options.general import PROMPT
 from tracking3d.errors import InputError
 
 Box = Annotated[

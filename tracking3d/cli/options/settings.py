@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tracking3d.cli.options.choices import Model, Quality
-from tracking3d.cli.options.panels import SETTINGS
+from tracking3d.cli.options.general import SETTINGS, Model, Quality
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
@@ -72,14 +71,13 @@ def configure(
         preset: Name of a preset.
         overrides: ``SECTION.KEY=VALUE`` items.
         quality: Name of a quality.
-        model: The final mesh, see `tracking3d.config.choices`.
+        model: The final mesh, see `tracking3d.config.loading`.
         **direct: Sections of settings that other options give; those that are None change nothing.
 
     Raises:
         InputError: A setting is unknown or invalid.
     """
-    from tracking3d.config.choices import check_model, set_model
-    from tracking3d.config.loading import load_config
+    from tracking3d.config.loading import check_model, load_config, set_model
     from tracking3d.config.models import AUTO
     from tracking3d.pipeline.tracker_selection import check_tracker_options
     from tracking3d.plugins import FEATURES, TRACKERS, check_options, plugin_label

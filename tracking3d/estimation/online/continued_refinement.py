@@ -12,7 +12,7 @@ from tracking3d.estimation.online.frame_tracker import FrameTracker
 from tracking3d.estimation.online.mapping.refined_map import move_to_refined, project_landmarks
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
-from tracking3d.estimation.refined_start import RefinedStart
+from tracking3d.estimation.solver import RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import pose_from_arrays
 

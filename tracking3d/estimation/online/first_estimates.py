@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.initialization.initial_map import with_contrast
@@ -15,13 +15,16 @@ from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, refine_local_map
 from tracking3d.estimation.online.masks.frame_estimates import learn_colours, make_estimate
 from tracking3d.estimation.online.optimization.types import PoseWeights
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate, assess_pose
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
-from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, fit_pose, pose_evidence
+from tracking3d.estimation.online.tracking.pose_tracking import (
+    find_inliers,
+    fit_pose,
+    pose_evidence,
+    resect_pose,
+)
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 

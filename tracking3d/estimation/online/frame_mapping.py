@@ -8,18 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.online.atlas.map_alignment import merge_maps
+from tracking3d.estimation.online.atlas.atlas import merge_maps
 from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, needs_keyframe
 from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
-from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
-from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
+from tracking3d.estimation.online.masks.frame_estimates import (
+    initial_estimate,
+    learn_colours,
+    make_estimate,
+    measure_mask_agreement,
+)
+from tracking3d.estimation.online.masks.mask_fusion import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.state.confidence import is_high_loss, is_misfit
 from tracking3d.estimation.online.state.solver_state import SolverState, thin_out
-from tracking3d.estimation.online.tracking.landmark_resection import resect_pose
 from tracking3d.estimation.online.tracking.motion_model import (
     TRAJECTORY_LENGTH,
     advance,
@@ -27,6 +30,7 @@ from tracking3d.estimation.online.tracking.motion_model import (
     pose_predictions,
     predict_points,
 )
+from tracking3d.estimation.online.tracking.pose_tracking import resect_pose
 from tracking3d.frames import Frame
 from tracking3d.runtime.stage_times import in_stage
 

@@ -7,17 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.estimate import RELOCALIZED
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
+from tracking3d.estimation.online.mapping.keyframe_insertion import cut_around_object
 from tracking3d.estimation.online.mapping.local_mapping import mask_weight
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.relocalization.pose_search import ROTATION_SEARCH, relocalize, should_retry
-from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
-from tracking3d.estimation.online.state.confidence import assess_pose, needs_relocalization
+from tracking3d.estimation.online.relocalization.pose_search import (
+    ROTATION_SEARCH,
+    overlaps_mask,
+    relocalize,
+    relocalize_in_frame,
+    should_retry,
+)
+from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
 from tracking3d.estimation.online.state.object_map import Keyframe
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion
 from tracking3d.estimation.online.tracking.pose_tracking import (
@@ -28,7 +33,6 @@ from tracking3d.estimation.online.tracking.pose_tracking import (
     pose_of_points,
 )
 from tracking3d.estimation.solver_base import SolverBase
-from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 

@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.gap import Gap, ModelCoverage
 from tracking3d.estimation.online.atlas.atlas import activate_largest_map, frames_of_map
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.frame_mapping import FrameMapping
 from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
-from tracking3d.estimation.online.mapping.keyframe_culling import prune_landmarks
+from tracking3d.estimation.online.mapping.keyframe_insertion import prune_landmarks
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.estimation.solver import Gap, ModelCoverage
 from tracking3d.frames import TRACKED_CONFIDENCE
 
 _ROOM = 1.5

@@ -21,8 +21,7 @@ from tracking3d.estimation.online.initialization.initializer import (
 from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
-from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, measure_mask_agreement
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame

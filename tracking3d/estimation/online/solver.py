@@ -28,24 +28,21 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
-from tracking3d.estimation.gap import PhotoEstimates, PhotoSet
 from tracking3d.estimation.online.atlas.atlas import (
     activate_largest_map,
     activate_map,
+    colours_match,
     guess_alignment,
+    is_fully_visible,
+    is_reliable,
     map_of_frame,
     mark_unaligned,
+    masks_overlap,
+    merge_maps,
+    needs_second_map,
     refine_inactive_map,
     switch_map,
     transform_estimates,
-)
-from tracking3d.estimation.online.atlas.map_alignment import merge_maps
-from tracking3d.estimation.online.atlas.reinitialization import (
-    colours_match,
-    is_fully_visible,
-    is_reliable,
-    masks_overlap,
-    needs_second_map,
 )
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import restart_without_points
@@ -62,14 +59,11 @@ from tracking3d.estimation.online.initialization.photo_tracks import Photo
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
-from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points
-from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
+from tracking3d.estimation.online.mapping.keyframe_insertion import cut_around_object, insert_points
 from tracking3d.estimation.online.mapping.object_model import object_model
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate
-from tracking3d.estimation.online.masks.mask_agreement import mask_agreement
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate, mask_agreement
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.relocalization.keypoint_matching import poses_from_matches
-from tracking3d.estimation.online.relocalization.pose_search import should_retry
+from tracking3d.estimation.online.relocalization.pose_search import poses_from_matches, should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
@@ -80,9 +74,8 @@ from tracking3d.estimation.online.tracking.motion_model import (
 )
 from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale
 from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
-from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.estimation.shape import Shape
-from tracking3d.estimation.solver import STATE_CLASSES
+from tracking3d.estimation.shape import Shape, first_mask, first_translation, mask_ellipse, prototype_mesh
+from tracking3d.estimation.solver import STATE_CLASSES, PhotoEstimates, PhotoSet
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays

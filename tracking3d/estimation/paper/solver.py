@@ -7,32 +7,37 @@ default is, so that preset ``paper`` is the pure recipe.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
 
-from tracking3d.config.solvers import PaperConfig
-from tracking3d.estimation.appearance import visible_texture
-from tracking3d.estimation.assessment import Assessment, assess
-from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
+from tracking3d.config.models import KeyframeConfig, PaperConfig
+from tracking3d.estimation.estimate import Assessment, FrameEstimate, MaskSource, ObjectModel, Status, assess
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.observation import Observation, ObservationBatch
-from tracking3d.estimation.paper.initialization import initialize_jointly
-from tracking3d.estimation.paper.keyframes import KeyframeCandidate, is_new_view, select_keyframes
-from tracking3d.estimation.paper.motion_model import candidate_poses
-from tracking3d.estimation.paper.optimize import Optimum, optimize
-from tracking3d.estimation.paper.problem import Problem
+from tracking3d.estimation.observation import Observation, ObservationBatch, downsample
+from tracking3d.estimation.paper.problem import Optimum, Parameters, Problem, optimize
 from tracking3d.estimation.paper.state import PaperState, PosedObservation
-from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.estimation.shape import Shape
+from tracking3d.estimation.shape import (
+    Shape,
+    first_mask,
+    first_translation,
+    mask_ellipse,
+    prototype_mesh,
+    visible_texture,
+)
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.geometry.pose import Pose
+from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_angle, rotation_exponential
 from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.rendering.visibility import NEAR
 from tracking3d.runtime.stage_times import in_stage
 
 
@@ -340,3 +345,179 @@ class PaperSolver(SolverBase):
             reason=assessment.reason,
             confidence=assessment.confidence,
         )
+
+
+# An initialization from the first few frames together, by several hypotheses of how the object rotates.
+#
+# Frame by frame against a wrong first shape the estimate locks into depth reversal or too little rotation while
+# its silhouette still fits. The hypothesis that re-renders all first frames best wins.
+
+RATES = (3.0, 8.0)
+"""Degrees a frame that the hypotheses turn."""
+DIRECTIONS = 8
+_SEMIFINALISTS = 6
+_FINALISTS = 2
+
+
+def initialize_jointly(
+    state: PaperState, frames: list[PosedObservation], config: PaperConfig, tau: float
+) -> Optimum:
+    """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
+
+    Args:
+        state: The initial shape and texture of every hypothesis.
+        frames: The first frames, with the poses found one by one: one of the hypotheses.
+        config: The solver's constants; ``stop`` is taken as ``plateau``.
+        tau: The encoder's convergence threshold.
+    """
+    config = config.model_copy(update={"stop": "plateau", "patience": config.init_iterations})
+    coarse, fine = (
+        Problem(state.shape, ObservationBatch.of(observations), config, backend=state.renderer)
+        for observations in (
+            [downsample(frame.observation) for frame in frames],
+            [frame.observation for frame in frames],
+        )
+    )
+    spent = 0
+    optima: list[Optimum] = []
+    starts = [state.parameters(frames), *hypotheses(state, frames)]
+    for problem, survivors, share in (
+        (coarse, len(starts), 3),
+        (coarse, _SEMIFINALISTS, 1),
+        (fine, _FINALISTS, 1),
+    ):
+        starts = starts[:survivors]
+        iterations = max(config.init_iterations // share, 1)
+        optima = [optimize(problem, start, iterations=iterations, tau=tau, fixed=1) for start in starts]
+        spent += sum(optimum.iterations for optimum in optima)
+        optima.sort(key=lambda optimum: math.inf if optimum.reason else optimum.total)
+        starts = [optimum.parameters for optimum in optima]
+    return replace(optima[0], iterations=spent)
+
+
+def hypotheses(state: PaperState, frames: list[PosedObservation]) -> list[Parameters]:
+    """No rotation; the rotations found so far mirrored in depth; turning in eight directions at two rates.
+
+    Translations are those found so far: they are seen directly.
+    """
+    first, found = frames[0].pose, Pose.stack([frame.pose for frame in frames])
+    elapsed = [frame.observation.index - frames[0].observation.index for frame in frames]
+    still = Pose(found.translation, first.quaternion.expand_as(found.quaternion))
+    variants = [still, _mirror(first, found)]
+    for direction in range(DIRECTIONS):
+        angle = 2 * math.pi * direction / DIRECTIONS
+        axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
+        variants += [_rotate(first, found, axis, rate, elapsed) for rate in RATES]
+    return [
+        Parameters(poses.translation, poses.quaternion, state.offsets, state.texture) for poses in variants
+    ]
+
+
+def _rotate(first: Pose, found: Pose, axis: Tensor, rate: float, elapsed: list[int]) -> Pose:
+    """The first rotation turned about ``axis`` by ``rate`` degrees in each of the elapsed frames, by 60 at most."""
+    angles = axis.new_tensor([math.radians(max(min(rate * frames, 60.0), -60.0)) for frames in elapsed])
+    turn = rotation_exponential(angles[:, None] * functional.normalize(axis, dim=0))
+    return from_matrix(turn @ first.R, found.translation)
+
+
+def _mirror(first: Pose, found: Pose) -> Pose:
+    """The rotations since the first frame with their tilt out of the image plane reversed (Necker)."""
+    delta = found.R @ first.R.T
+    flip = torch.diag(delta.new_tensor([1.0, 1.0, -1.0]))
+    return from_matrix(flip @ delta @ flip @ first.R, found.translation)
+
+
+# Which frames stay in the optimization (paper section 3.4, "Keyframe selection criteria").
+#
+# All criteria are judged again after every joint optimization (in preset ``paper`` that is every frame), so a
+# keyframe can fall out.
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeCandidate:
+    """A keyframe, or the current frame, as it stands after the optimization."""
+
+    pose: Pose  # its pose now
+    silhouette_loss: float  # L_S of this frame alone
+    appearance_loss: float  # L_F of this frame alone
+
+
+def select_keyframes(
+    candidates: Sequence[KeyframeCandidate], object_size: float, tau: float, config: KeyframeConfig
+) -> list[int]:
+    """Positions of the candidates that are keyframes from now on.
+
+    Args:
+        candidates: The keyframes so far in order of time, then the current frame.
+        object_size: Diameter of the object in object units.
+        tau: Convergence threshold of the appearance loss.
+        config: The criteria.
+    """
+    limit = config.features or tau
+    kept: list[int] = []
+    for position, candidate in enumerate(candidates):
+        anchor = config.keep_first and position == 0
+        consistent = candidate.silhouette_loss < config.silhouette and candidate.appearance_loss < limit
+        latest = candidates[kept[-1]].pose if kept else None
+        if anchor or (
+            consistent and (latest is None or is_new_view(latest, candidate.pose, object_size, config))
+        ):
+            kept.append(position)
+    if config.keep_first and len(kept) > config.maximum:
+        return thin_out(kept, config.maximum)
+    return kept[-config.maximum :]
+
+
+def is_new_view(latest: Pose, pose: Pose, object_size: float, config: KeyframeConfig) -> bool:
+    """Whether the object moved or turned enough since the latest keyframe."""
+    moved = float(torch.linalg.vector_norm(pose.translation - latest.translation))
+    turned = math.degrees(float(rotation_angle(latest.quaternion, pose.quaternion)))
+    return moved > config.translation * object_size or turned > config.rotation
+
+
+def thin_out(kept: list[int], maximum: int) -> list[int]:
+    """Half the most recent, half spread evenly over the older ones; the first always stays."""
+    recent = kept[len(kept) - maximum // 2 :]
+    older = kept[: len(kept) - maximum // 2]
+    count = maximum - len(recent)
+    chosen = [older[round(i * (len(older) - 1) / max(count - 1, 1))] for i in range(count)]
+    return sorted(set(chosen) | set(recent))
+
+
+def candidate_poses(state: PaperState, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
+    """The last pose, constant velocity, and their rotations moved to the mask.
+
+    After a lost frame there is no velocity to go on with; the keyframes' poses are tried instead.
+    """
+    last, last_index = state.last
+    candidates = [last]
+    if state.before is not None:
+        before, before_index = state.before
+        steps = (index - last_index) / max(last_index - before_index, 1)
+        candidates.append(extrapolate(before, last, min(steps, 3.0)))
+    else:
+        candidates += [keyframe.pose for keyframe in state.keyframes]
+    if mask is not None and mask.any():
+        candidates += [shift_to_mask(state, pose, mask) for pose in list(candidates)]
+    return candidates
+
+
+def shift_to_mask(state: PaperState, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
+    """Shift a pose so that its silhouette has the mask's centroid and area."""
+    silhouette = state.silhouette(pose)
+    camera = state.camera
+    x1, y1 = _centroid(mask)
+    if silhouette.any():
+        x0, y0 = _centroid(silhouette)
+        ratio = float(np.clip(np.sqrt(silhouette.sum() / mask.sum()), 0.8, 1.25))
+    else:  # the pose has left the view: bring its centre back
+        x, y, z = pose.translation.tolist()
+        x0, y0 = camera.cx + camera.fx * x / max(z, NEAR), camera.cy + camera.fy * y / max(z, NEAR)
+        ratio = 1.0
+    depth = float(pose.translation[2])
+    shift = pose.translation.new_tensor([(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0])
+    return Pose((pose.translation + shift) * ratio, pose.quaternion)
+
+
+def _centroid(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    return np.argwhere(mask)[:, ::-1].mean(0)

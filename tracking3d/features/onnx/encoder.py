@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Self
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 from torch.nn import functional
 
+from tracking3d.config.explain import describe_validation_error
+from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.features.onnx.description import EncoderDescription, NetworkInput, load_encoder_description
+from tracking3d.networks.catalogue import description_names, read_description
 from tracking3d.networks.session import Network, TensorInfo
 from tracking3d.networks.store import find_network
 
@@ -191,3 +194,84 @@ def _check_sum(network: Network, description: EncoderDescription, maps: list[Ten
             f"The outputs of {network.file} have {', '.join(map(str, counts))} channels and cannot be added; "
             "write 'combine: concatenate'."
         )
+
+
+PACKAGE = "tracking3d.features.onnx"
+"""The package whose folder ``descriptions`` holds the built-in descriptions."""
+
+Triple = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class NetworkInput(Section):
+    """How an image becomes a network's input: RGB in [0, 1] scaled, the mean removed, divided by the deviation."""
+
+    name: str | None = Field(None, description="Name of the input; the network's only input if not given.")
+    scale: float = Field(1.0, gt=0, description="Factor for the image, applied first: 1 or 255.")
+    mean: Triple = Field((0.0, 0.0, 0.0), description="Mean subtracted after that: red, green, blue.")
+    std: tuple[Positive, Positive, Positive] = Field(
+        (1.0, 1.0, 1.0), description="Standard deviation divided by after that: red, green, blue."
+    )
+    channels: Literal["rgb", "bgr"] = Field("rgb", description="Order of the channels.")
+    multiple: int = Field(
+        32,
+        ge=1,
+        le=1024,
+        description="Height and width must be multiples of this, unless the network fixes them.",
+    )
+    fit: Literal["pad", "resize"] = Field(
+        "pad",
+        description="How sizes become multiples: by repeating the right and lower border, or by resizing.",
+    )
+
+
+class EncoderDescription(Section):
+    """A dense feature network. Without any key it is what most are: RGB in [0, 1], one map, unit length."""
+
+    title: str = Field("", description="Description for readers.")
+    link: str = Field("", description="Origin, for readers.")
+    input: NetworkInput = NetworkInput()
+    output: str | tuple[str, ...] | None = Field(
+        None,
+        description="Name of the feature map, or of several; the one with the most channels if not given.",
+    )
+    combine: Literal["concatenate", "sum"] = Field(
+        "concatenate", description="How several maps are combined after resizing to the size of the result."
+    )
+    stride: int | None = Field(
+        None,
+        ge=1,
+        le=256,
+        description="Image pixels per feature pixel; that of the (first) map if not given.",
+    )
+    normalise: Literal["unit", "each", "none"] = Field(
+        "unit",
+        description="Whether features are normalized to unit length: each of several maps and then all, or not at all.",
+    )
+    tau: float = Field(0.05, gt=0, description="Appearance loss below which a frame counts as explained.")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The outputs that are named."""
+        return (self.output,) if isinstance(self.output, str) else self.output or ()
+
+
+def load_encoder_description(name: str | Path) -> EncoderDescription:
+    """Read a description.
+
+    Args:
+        name: Name of a description that comes with the package, or a YAML file.
+
+    Raises:
+        InputError: If there is no such description, or a key or value in it cannot be used.
+    """
+    file, keys = read_description(name, PACKAGE, "description of a feature network")
+    try:
+        return EncoderDescription.model_validate(keys)
+    except ValidationError as error:
+        raise InputError(f"{file}: {describe_validation_error(error, EncoderDescription, 'key')}") from error
+
+
+def builtin_encoder_descriptions() -> list[str]:
+    """Names of the descriptions that come with the package."""
+    return description_names(PACKAGE)

@@ -1,4 +1,4 @@
-"""Patches aligned one after the other; `tracking3d.points.alignment` says what is computed."""
+"""Patches aligned one after the other; `tracking3d.points.warping` says what is computed."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations

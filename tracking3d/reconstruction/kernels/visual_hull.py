@@ -1,4 +1,4 @@
-"""The robust visual hull, voxel by voxel; `tracking3d.reconstruction.visual_hull` says what is computed."""
+"""The robust visual hull, voxel by voxel; `tracking3d.reconstruction.shape` says what is computed."""
 
 from __future__ import annotations
 

@@ -13,10 +13,17 @@ from numba import float32, float64, int64, void
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel, record
+from tracking3d.rendering.kernels.compilation import (
+    OPTIONS,
+    REORDER,
+    array,
+    check_corners,
+    kernel,
+    record,
+    share,
+)
 from tracking3d.rendering.kernels.interpolation import slopes_of_face
 from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
-from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.renderer import Rendering
 
 

@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel, record
-from tracking3d.rendering.kernels.threads import share
+from tracking3d.rendering.kernels.compilation import (
+    OPTIONS,
+    REORDER,
+    array,
+    check_corners,
+    kernel,
+    record,
+    share,
+)
 
 _TINY = np.finfo(np.float32).tiny
 

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, kernel
-from tracking3d.rendering.kernels.threads import get_num_threads, share
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, get_num_threads, kernel, share
 
 _PIXELS, _ROWS, _WORK = 4000, 64, 400_000  # worth another thread: pixels, rows, values of pixels
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, kernel
-from tracking3d.rendering.kernels.threads import share
+from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, kernel, share
 
 
 def rasterize(

@@ -14,8 +14,7 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.confidence import Judgement, inside_distance, outline_margin
 from tracking3d.trackers.crops import box_iou, box_of, crop_window, inside_frame
-from tracking3d.trackers.onnx.images import enlarge
-from tracking3d.trackers.onnx.proposals import Proposal
+from tracking3d.trackers.onnx.images import Proposal, enlarge
 
 _MARGIN, _SIZE = 0.45, 160  # of the crops that colours are taken from
 _BAND = 0.05  # of the square root of the area: pixels this near the outline are of neither side

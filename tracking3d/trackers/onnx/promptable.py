@@ -13,9 +13,16 @@ from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.onnx.description import Decoder, PromptableNetwork
-from tracking3d.trackers.onnx.images import Letterbox, fit_image, network_input, on_image, sigmoid
+from tracking3d.trackers.onnx.images import (
+    Letterbox,
+    Proposal,
+    fit_image,
+    network_input,
+    on_image,
+    sharpness,
+    sigmoid,
+)
 from tracking3d.trackers.onnx.judging import background_points
-from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 from tracking3d.trackers.onnx.saliency import validate_name
 
 Points = NDArray[np.float32]

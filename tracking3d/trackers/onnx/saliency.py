@@ -12,8 +12,15 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
 from tracking3d.trackers.onnx.description import SaliencyNetwork
-from tracking3d.trackers.onnx.images import enlarge, fit_image, network_input, on_image, sigmoid
-from tracking3d.trackers.onnx.proposals import Proposal, sharpness
+from tracking3d.trackers.onnx.images import (
+    Proposal,
+    enlarge,
+    fit_image,
+    network_input,
+    on_image,
+    sharpness,
+    sigmoid,
+)
 
 # Nothing beyond the box, enlarged by this, is the object; the user's first box is nearer to it than a
 # tracker's.

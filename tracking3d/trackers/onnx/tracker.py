@@ -2,21 +2,112 @@
 
 from __future__ import annotations
 
-from typing import Self
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from tracking3d.errors import PluginError
+from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
+from tracking3d.networks.store import find_network
 from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
+from tracking3d.trackers.csrt import CsrtTracker
 from tracking3d.trackers.first_mask import mask_in_box
+from tracking3d.trackers.onnx.boxes import BoxProposer, CsrtBoxes, nano_boxes, vit_boxes
+from tracking3d.trackers.onnx.description import SaliencyNetwork, load_segmenter_description
+from tracking3d.trackers.onnx.images import TRIAL_BOX, TRIAL_IMAGE, PointSegmenter, Segmenter
 from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
-from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
-from tracking3d.trackers.onnx.proposals import PointSegmenter
-from tracking3d.trackers.onnx.schedule import NetworkSchedule
+from tracking3d.trackers.onnx.promptable import PromptableSegmenter
+from tracking3d.trackers.onnx.saliency import SaliencySegmenter
+from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import ColourSegmentation
+
+
+class OnnxOptions(Options):
+    """Options of ``onnx``."""
+
+    segmenter: str = Field(
+        "u2netp", description="Description of inputs and outputs: a built-in name, or a YAML file."
+    )
+    model: str | None = Field(None, description="Saliency network: ONNX file, or name of a known network.")
+    encoder: str | None = Field(None, description="Image encoder: ONNX file or known name.")
+    decoder: str | None = Field(None, description="Prompt decoder: ONNX file or known name.")
+    box: Literal["csrt", "nano", "vit"] = Field(
+        "csrt", description="Box tracker: CSR-DCF, or NanoTrack or VitTrack from ONNX files."
+    )
+    nano_backbone: str = Field(
+        "nanotrack-backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
+    )
+    nano_head: str = Field(
+        "nanotrack-head", description="NanoTrack's head: ONNX file, or name of a known network."
+    )
+    vit_model: str = Field(
+        "vittrack", description="VitTrack's network: ONNX file, or name of a known network."
+    )
+    csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="Options of CSR-DCF.")
+    every: Annotated[int, Field(ge=1, le=1000)] | Literal["auto"] = Field(
+        1,
+        description="Run the network in every k-th frame, or (auto) if the propagated mask is in doubt, was corrected, "
+        "or has moved or changed much; flow propagates the mask in between.",
+    )
+    crops: tuple[Annotated[float, Field(ge=1, le=4)], ...] = Field(
+        (1.2, 1.5), min_length=1, description="Saliency network: factors by which the box is enlarged."
+    )
+    anchor: bool = Field(True, description="Re-initialize the box tracker on the box of a confident mask.")
+    threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
+
+
+def build_segmenter(options: OnnxOptions) -> Segmenter:
+    """The segmentation network that ``options`` ask for, once it was asked about an image.
+
+    Raises:
+        InputError: If a description or a file is missing or cannot be used, or if what it says is no mask.
+    """
+    description = load_segmenter_description(options.segmenter)
+
+    def file(option: str, given: str | None, default: str | None) -> Path:
+        return _file(option, given or default, f"the segmenter '{options.segmenter}'")
+
+    segmenter: Segmenter
+    if isinstance(description, SaliencyNetwork):
+        model = file("model", options.model, description.model)
+        segmenter = SaliencySegmenter(model, description, options.crops, options.threads)
+    else:
+        encoder = file("encoder", options.encoder, description.encoder_model)
+        decoder = file("decoder", options.decoder, description.decoder_model)
+        segmenter = PromptableSegmenter(encoder, decoder, description, options.threads)
+    segmenter.propose(TRIAL_IMAGE, TRIAL_BOX, None)
+    return segmenter
+
+
+def build_boxes(options: OnnxOptions) -> BoxProposer:
+    """The box tracker that ``options`` ask for.
+
+    Raises:
+        InputError: If a file is missing or cannot be used.
+    """
+    match options.box:
+        case "nano":
+            backbone = _file("nano_backbone", options.nano_backbone, "the box tracker NanoTrack")
+            return nano_boxes(backbone, _file("nano_head", options.nano_head, "the box tracker NanoTrack"))
+        case "vit":
+            return vit_boxes(_file("vit_model", options.vit_model, "the box tracker VitTrack"))
+        case _:
+            return CsrtBoxes(options.csrt)
+
+
+def _file(option: str, name: str | None, whose: str) -> Path:
+    """The file of a network; errors name the option that gives it."""
+    if name is None:
+        raise InputError(f"No ONNX file is given for {whose}; set the option tracker.{option}.")
+    try:
+        return find_network(name)
+    except InputError as error:
+        raise InputError(f"For {whose} (option tracker.{option}): {error}") from error
+
 
 _LEAST_SHARPNESS = 0.35  # of a network's mask; below, it has not found anything
 _LEAST_AGREEMENT = 0.3  # IoU of the mask's box and the box tracker's
@@ -197,3 +288,62 @@ def _unusable(verdict: Verdict) -> str:
         return "the network's mask is blurred"
     agreement = verdict.judgement.agreement
     return "" if agreement is None or agreement >= _LEAST_AGREEMENT else verdict.judgement.doubt
+
+
+_LONGEST = 6  # frames without a new mask of the network
+_DROPPED = 0.85  # of the score right after the network's mask
+_CHANGED = 0.7  # IoU with the box of the network's mask, moved to the same centre
+_APART = 0.1  # drop of the IoU of the mask's box and the box tracker's
+
+
+@dataclass
+class NetworkSchedule:
+    """Decides in which frames the network is run."""
+
+    # it is run in every k-th frame; auto: if something has changed since its last mask, and in every sixth
+    # frame
+    every: int | Literal["auto"]
+    _frames: int = 0
+    _size: Box | None = None
+    _score: float | None = None
+    _agreement: float | None = None
+    _corrected: bool = False
+
+    def is_due(self, carried: MaskEstimate, box: Box | None) -> bool:
+        """Whether the network is to be run in the present frame.
+
+        Args:
+            carried: The propagated mask.
+            box: ``(x, y, w, h)`` of the box tracker; None if it has lost the object.
+        """
+        self._frames += 1
+        if carried.reason or carried.mask is None:
+            return True
+        if self.every != "auto":
+            return self._frames >= self.every
+        found = box_of(carried.mask)
+        if found is None or box is None or self._corrected or self._frames >= _LONGEST:
+            return True
+        agreement = box_iou(found, box)
+        if self._score is None or self._agreement is None:  # the first mask that was propagated
+            self._score, self._agreement = carried.score, agreement
+        changed = self._size is None or _same_size(found, self._size) < _CHANGED
+        return changed or carried.score < _DROPPED * self._score or agreement < self._agreement - _APART
+
+    def was_run(self, box: Box | None) -> None:
+        """Begin again after a mask of the network.
+
+        Args:
+            box: ``(x, y, w, h)`` of that mask.
+        """
+        self._frames, self._corrected = 0, False
+        self._size, self._score, self._agreement = box, None, None
+
+    def was_corrected(self) -> None:
+        """Take note that the solver has disagreed with the last mask."""
+        self._corrected = True
+
+
+def _same_size(one: Box, other: Box) -> float:
+    """IoU of two boxes that are moved to the same centre."""
+    return box_iou((-one[2] / 2, -one[3] / 2, *one[2:]), (-other[2] / 2, -other[3] / 2, *other[2:]))

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from tracking3d.config.loading import parse_yaml
 from tracking3d.config.models import PluginChoice
-from tracking3d.config.yaml_files import parse_yaml
 from tracking3d.errors import InputError
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Image

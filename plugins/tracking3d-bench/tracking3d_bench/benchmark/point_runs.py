@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.points.follow import follow_points
-from tracking3d.points.uncertainty import FEATURES
+from tracking3d.points.follow import FEATURES, follow_points
 from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.video.image_file import read_image
@@ -50,7 +49,7 @@ class PointErrors:
     error: NDArray[np.float64]  # (M,) pixels of the frame
     uncertainty: NDArray[np.float64]  # (M,)
     measured: NDArray[np.bool_]  # (M,) bool
-    features: NDArray[np.float64]  # (M, F), see `tracking3d.points.uncertainty.error_features`
+    features: NDArray[np.float64]  # (M, F), see `tracking3d.points.follow.error_features`
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, grouped, numbers
-from tracking3d.cli.options.panels import OUTPUT, PERFORMANCE
+from tracking3d.cli.options.general import OUTPUT, PERFORMANCE
 from tracking3d.errors import InputError
 from tracking3d.runtime.progress import report_progress
 from tracking3d_bench.cli.fresh import Count, Meshes, draw_suite

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.rigid import is_rigid, nearest_rigid
+from tracking3d.geometry.alignment import is_rigid, nearest_rigid
 from tracking3d_bench.datasets.json_files import read_json
 
 LARGEST_STEP = 0.01

@@ -24,7 +24,7 @@ from scipy.spatial.distance import pdist
 from trimesh.exchange.ply import export_ply
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.rigid import is_rigid
+from tracking3d.geometry.alignment import is_rigid
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
 from tracking3d.video.image_file import read_image
 from tracking3d_bench.datasets.truth import MeshFile, Truth

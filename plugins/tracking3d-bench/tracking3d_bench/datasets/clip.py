@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
+from tracking3d.geometry.alignment import is_rigid, nearest_rigid
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.rigid import is_rigid, nearest_rigid
 from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.synthesis.convex_clips import write_clip as write_clip
 from tracking3d.trackers.crops import box_of

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from tracking3d.config.explain import describe_validation_error, hint
+from tracking3d.config.loading import read_mapping
 from tracking3d.config.models import Section
-from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
 
 PLACEHOLDERS = frozenset(("sequence", "object", "frame", "instance"))

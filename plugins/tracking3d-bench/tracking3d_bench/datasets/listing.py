@@ -9,7 +9,7 @@ import numpy as np
 
 from tracking3d.config.explain import hint
 from tracking3d.errors import InputError
-from tracking3d.video.selection import natural_order
+from tracking3d.video.source import natural_order
 from tracking3d_bench.datasets.bop import read_scene_gt
 from tracking3d_bench.datasets.layout import DatasetLayout
 from tracking3d_bench.datasets.masks import read_labels

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tracking3d.errors import InputError
-from tracking3d.video.selection import natural_order
+from tracking3d.video.source import natural_order
 
 
 class _Value(str):

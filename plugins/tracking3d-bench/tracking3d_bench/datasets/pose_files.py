@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.rigid import nearest_rigid
+from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d.trackers.vot_regions import parse_numbers
 
 

@@ -19,7 +19,7 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.video.image_sequence import ImageSequence
-from tracking3d.video.selection import parse_selection, within
+from tracking3d.video.source import parse_selection, within
 from tracking3d_bench.datasets.answers import Answers
 from tracking3d_bench.datasets.truth import MaskFile, MaskReference, Truth
 

@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from tracking3d.estimation.paper import losses
+from tracking3d.estimation.paper import problem
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.rendering import Rendering, channels_last, texture_losses
 
@@ -91,8 +91,8 @@ class RenderScene:
         pixel_loss, smooth = texture_losses(
             drawn.texture, drawn.uv, self.features, drawn.pixels, _CAUCHY_SCALE, backend=drawn.backend
         )
-        appearance = losses.appearance_loss(pixel_loss, drawn.pixels, valid, _CAUCHY_SCALE).mean()
-        silhouette = losses.iou_loss(drawn.silhouette, self.mask, valid).mean()
+        appearance = problem.appearance_loss(pixel_loss, drawn.pixels, valid, _CAUCHY_SCALE).mean()
+        silhouette = problem.iou_loss(drawn.silhouette, self.mask, valid).mean()
         return appearance + silhouette + _TOTAL_VARIATION_WEIGHT * smooth
 
     def forget_gradients(self) -> None:

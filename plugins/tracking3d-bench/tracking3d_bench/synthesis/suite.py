@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 
 from tracking3d.config.explain import hint
-from tracking3d.config.yaml_files import read_mapping
+from tracking3d.config.loading import read_mapping
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results.files import write_atomic, writing
 from tracking3d_bench.synthesis.fresh import FRESH, fresh_suite, seed_of

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust, reversal_of
 from tracking3d.bundle_adjustment.reprojection import FloatArray, transform_to_camera
-from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -38,17 +37,17 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     match_photos,
     neighbouring_pairs,
 )
-from tracking3d.estimation.online.initialization.registration import subset_of
 from tracking3d.estimation.online.initialization.structure_from_motion import (
     image_deformation,
     structure_hypotheses,
+    subset_of,
 )
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape
 from tracking3d.estimation.online.optimization.pnp import pose_from_points
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.prototype_start import RADIUS
+from tracking3d.estimation.shape import RADIUS
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays, pose_from_arrays
 

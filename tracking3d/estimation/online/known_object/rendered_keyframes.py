@@ -23,8 +23,7 @@ from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.features.sift import detect
 from tracking3d.estimation.online.mapping.local_mapping import with_landmarks
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.prototype_start import RADIUS
-from tracking3d.estimation.shape import Shape
+from tracking3d.estimation.shape import RADIUS, Shape
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window

@@ -1,7 +1,7 @@
 """Reverses the map's depth if that explains its keyframes better.
 
 The initialization chooses between the two reversals; after a small rotation its choice can be wrong. See
-`tracking3d.bundle_adjustment.reversal`.
+`tracking3d.bundle_adjustment.adjustment`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from tracking3d.bundle_adjustment.adjustment import Structure, adjust
-from tracking3d.bundle_adjustment.reversal import Reversal, reversal_of
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.mapping.local_mapping import (
     shared_landmarks,

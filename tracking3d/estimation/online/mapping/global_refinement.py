@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping.focal_length import lens_change, solve_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, render_cost

@@ -8,19 +8,19 @@ from itertools import takewhile
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.features.sift import detect
 from tracking3d.estimation.online.mapping.candidate_landmarks import promote_candidates, with_candidates
-from tracking3d.estimation.online.mapping.keyframe_culling import cull_keyframes, prune_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import refine_map, window_of, with_landmarks
 from tracking3d.estimation.online.mapping.photometric_adjustment import refine_without_points
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import rotation_angle
+from tracking3d.geometry.pose import Pose, rotation_angle
+from tracking3d.points.landmark_adjustment import LandmarkScene
+from tracking3d.points.view import LANDMARK_WINDOW, GreyWindow, SurfaceView, cut_window, draw_into_window
 
 _FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
 _MIN_INTERVAL = 3  # frames between two such keyframes
@@ -113,3 +113,88 @@ def refine_local_map(
 def _leading_adjusted(object_map: ObjectMap, positions: list[int]) -> int:
     """How many of the first keyframes at some positions have poses that dense landmarks have adjusted."""
     return len(list(takewhile(lambda position: object_map.keyframes[position].is_adjusted, positions)))
+
+
+def cull_keyframes(keyframes: tuple[Keyframe, ...], most: int) -> tuple[Keyframe, ...]:
+    """At most ``most`` keyframes: the later of the two most similar older ones goes; the first and recent half stay."""
+    kept = list(keyframes)
+    while len(kept) > most:
+        older = kept[: max(len(kept) - most // 2, 2)]
+        # Compared with later ones, each would go as it leaves the recent half, and none between would be kept.
+        gaps = [
+            min(
+                float(rotation_angle(older[place].pose.quaternion, other.pose.quaternion))
+                for other in older[:place]
+            )
+            for place in range(1, len(older))
+        ]
+        kept.pop(1 + int(np.argmin(gaps)))
+    return tuple(kept)
+
+
+def prune_landmarks(object_map: ObjectMap, followed: FollowedPoints) -> tuple[ObjectMap, FollowedPoints]:
+    """The map without landmarks that no keyframe shows and no tracked point belongs to; the rest are renumbered."""
+    used = np.zeros(len(object_map.landmarks), bool)
+    used[followed.landmark] = True
+    for view in object_map.keyframes:
+        used[view.points.landmark] = True
+        used[view.keypoint_landmark[view.keypoint_landmark >= 0]] = True
+    number = np.cumsum(used) - 1
+
+    def renamed(points: FollowedPoints) -> FollowedPoints:
+        return FollowedPoints(number[points.landmark], points.pixel)
+
+    def relabelled(label: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.where(label >= 0, number[label], -1)
+
+    keyframes = tuple(
+        replace(view, points=renamed(view.points), keypoint_landmark=relabelled(view.keypoint_landmark))
+        for view in object_map.keyframes
+    )
+    object_map = replace(
+        object_map,
+        landmarks=object_map.landmarks[used],
+        candidate=object_map.candidate[used],
+        keyframes=keyframes,
+    )
+    return object_map, renamed(followed)
+
+
+def cut_around_object(
+    object_map: ObjectMap,
+    camera: Camera,
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    pose: Pose,
+) -> GreyWindow | None:
+    """The window of a frame in which landmarks are followed; None if there is nothing to be followed.
+
+    Args:
+        object_map: The map.
+        camera: The camera of the full frame.
+        image: ``(H, W, 3)`` the frame.
+        mask: ``(H, W)`` of the object.
+        pose: Where the object is about.
+    """
+    if mask is None or object_map.pointless or object_map.fixed_keyframes:
+        return None
+    vertices = object_map.landmark_scene.vertices
+    return cut_window(image, mask, camera, pose.matrix().numpy(), vertices, LANDMARK_WINDOW)
+
+
+def draw_keyframe(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> SurfaceView | None:
+    """A keyframe, or a frame that may become one, with the map's surface drawn at a pose; None if it has no window."""
+    if view.image is None:
+        return None
+    scene = object_map.landmark_scene
+    return draw_into_window(view.image, camera, pose.matrix().numpy(), scene.vertices, scene.faces)
+
+
+def draw_keyframes(object_map: ObjectMap, camera: Camera, positions: list[int]) -> LandmarkScene:
+    """The map's scene with keyframes drawn at these positions, as far as they have windows."""
+    scene = object_map.landmark_scene
+    for position in positions:
+        if scene.views[position] is None:
+            view = object_map.keyframes[position]
+            scene.views[position] = draw_keyframe(object_map, camera, view, view.pose)
+    return scene

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens, state_through_lens
-from tracking3d.estimation.online.mapping.keyframe_views import draw_keyframes
+from tracking3d.estimation.online.mapping.keyframe_insertion import draw_keyframes
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of, window_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap

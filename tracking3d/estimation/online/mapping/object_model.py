@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.shape import visible_texture
 from tracking3d.rendering import BackProjection, Surface
 
 

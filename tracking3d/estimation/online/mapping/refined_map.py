@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tracking3d.config.solvers import OnlineConfig
+from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.local_mapping import refine_map
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.refined_start import RefinedStart
+from tracking3d.estimation.solver import RefinedStart
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 

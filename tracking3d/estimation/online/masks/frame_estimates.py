@@ -8,16 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
-from tracking3d.estimation.online.masks.mask_agreement import initial_mask_weight
+from tracking3d.estimation.estimate import MOTION_RATIO, FrameEstimate, MaskSource, Status
 from tracking3d.estimation.online.masks.mask_fusion import FusedMask, fuse_mask, update_colours
-from tracking3d.estimation.online.optimization.observability import least_constrained_axis
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
-from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.tracker_feedback import MOTION_RATIO
+from tracking3d.estimation.online.optimization.pose_refinement import least_constrained_axis
+from tracking3d.estimation.online.state.confidence import PoseCandidate
+from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.solver_state import MaskAgreement, SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
+from tracking3d.segmentation.frame_window import Answered, FrameWindow
+from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
 
 
 def initial_estimate(
@@ -97,3 +98,63 @@ def make_estimate(
             MOTION_RATIO: weighed.moving,
         },
     )
+
+
+_MOST_KEYFRAMES = 16
+_GROWTH = 1.5
+"""The agreement is measured again when there are so many times more keyframes: each time costs .2 s."""
+_SLACK = 1.5
+"""Causal poses are less exact than refined ones, and masks differ more from their hull."""
+_USUAL, _ANOTHER = 0.05, 0.15
+"""Share of a mask that may lie beyond the silhouette above the usual one; from the second on it shows another thing."""
+
+
+def measure_mask_agreement(state: SolverState) -> SolverState:
+    """The state with the agreement of its keyframes' masks, if there are enough more of these than the last time."""
+    measured, count = state.mask_agreement.keyframes, len(state.object_map.keyframes)
+    if measured <= count < max(_GROWTH * measured, 1):
+        return state
+    return replace(state, mask_agreement=mask_agreement(state.object_map, state.camera))
+
+
+def initial_mask_weight(
+    agreement: MaskAgreement, initial: NDArray[np.bool_], silhouette: NDArray[np.bool_]
+) -> float:
+    """The weight of a frame's initial mask, in [0, 1]: less if more of it than usual lies beyond the silhouette.
+
+    Args:
+        agreement: That of the keyframes.
+        initial: ``(H, W)`` the frame's initial mask.
+        silhouette: ``(H, W)`` at the frame's pose. What hides a part of the object takes it from the mask alone.
+    """
+    if not agreement.weight:
+        return 0.0
+    more = share_beyond(initial, silhouette) - agreement.beyond
+    return agreement.weight * float(np.clip((_ANOTHER - more) / (_ANOTHER - _USUAL), 0, 1))
+
+
+def share_beyond(mask: NDArray[np.bool_], silhouette: NDArray[np.bool_]) -> float:
+    """The share of a mask that lies beyond a silhouette of the same size; 0 of an empty mask."""
+    return np.count_nonzero(mask & ~silhouette) / max(int(np.count_nonzero(mask)), 1)
+
+
+def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
+    """The agreement of the keyframes' masks; see `tracking3d.segmentation.initial_mask_agreement`."""
+    vertices = object_map.vertices.cpu().numpy().astype(np.float64)
+    faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
+    views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
+    places = np.linspace(0, len(views) - 1, min(_MOST_KEYFRAMES, len(views))).round().astype(int)
+    found, beyond = InitialMaskAgreement(vertices, _SLACK), list[float]()
+    for view in (views[place] for place in places):
+        assert view.mask is not None
+        image = np.zeros((*view.mask.shape, 3), np.uint8)
+        T_cam_obj = view.pose.matrix().numpy().astype(np.float64)
+        scene = FrameWindow.of(
+            Answered(view.index, image, view.mask, view.mask, T_cam_obj, 1.0), camera, vertices, faces
+        )
+        if scene is not None:
+            found.see(scene)
+            beyond.append(share_beyond(scene.initial, scene.drawn))
+    found.settle()
+    usual = float(np.median(beyond)) if beyond else 0.0
+    return MaskAgreement(found.weight, usual, len(object_map.keyframes))

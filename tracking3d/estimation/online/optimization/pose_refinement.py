@@ -6,11 +6,13 @@ nowhere; each is charged, so that the object does not turn to where nothing cont
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
@@ -168,3 +170,26 @@ def render_cost(fit: PoseFit, weights: PoseWeights, mask_weight: float) -> float
     """What poses from different points are compared by: the cost without them."""
     missed = mask_weight * (1 - fit.overlap)
     return weights.appearance * fit.appearance + weights.outline * mask_weight * fit.outline + missed
+
+
+TURN = 10.0
+"""Degrees of the rotation whose cost is computed."""
+
+
+def least_constrained_axis(fit: PoseFit) -> tuple[float, NDArray[np.float64]]:
+    """The cost of rotating the object about its least constrained axis, and that axis ``(3,)`` in camera axes.
+
+    By the normal equations: translation and the other rotations may compensate. A solid of revolution without texture
+    rotates about its axis at no cost, whatever its outline says otherwise.
+
+    Returns:
+        The cost of a rotation by `TURN` degrees, in units of `PoseFit.cost`; 0 if nothing constrains it.
+    """
+    information = fit.information.double().cpu().numpy()
+    moves, coupling, turns = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    floor = 1e-9 * max(float(np.trace(moves)), 1e-12)
+    held = turns - coupling.T @ np.linalg.solve(moves + floor * np.eye(3), coupling)
+    if not np.isfinite(held).all():
+        return 0.0, np.array([0.0, 0.0, 1.0])
+    values, axes = np.linalg.eigh((held + held.T) / 2)
+    return max(float(values[0]), 0.0) * math.radians(TURN) ** 2 / 2, axes[:, 0]

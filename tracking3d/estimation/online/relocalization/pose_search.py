@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -10,10 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracking3d.estimation.estimate import ELSEWHERE
+from tracking3d.estimation.observation import projected_box
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.estimation.online.mapping.local_mapping import (
+    nearest_views,
+)
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.relocalization.keypoint_matching import match_keyframes
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.tracking.motion_model import align_to_mask
 from tracking3d.estimation.online.tracking.pose_tracking import (
@@ -21,6 +27,8 @@ from tracking3d.estimation.online.tracking.pose_tracking import (
     count_inliers,
     find_inliers,
     fit_pose,
+    pixel_scale,
+    pose_of_points,
 )
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
@@ -114,3 +122,91 @@ def relocalize(
         tried,
         key=lambda one: candidate_cost(one[1], weights, view.mask_weight, count_inliers(object_map, one[2])),
     )
+
+
+_MAX_KEYFRAMES = 6  # most keyframes that a doubtful frame is matched with
+
+
+def match_keyframes(
+    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], anywhere: bool
+) -> list[tuple[Pose, FollowedPoints]]:
+    """Poses from keypoints matched with keyframes, most inliers first.
+
+    Args:
+        object_map: The map.
+        camera: The camera of the full frame.
+        view: The frame, with the best pose so far.
+        image: ``(H, W)`` grey.
+        anywhere: Whether to match more keyframes than those with the nearest viewing directions.
+    """
+    region = np.ones(image.shape, bool) if view.mask is None else view.mask
+    others = nearest_views(
+        object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _MAX_KEYFRAMES
+    )
+    keypoints = detect(image, region)
+    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _MAX_KEYFRAMES], pixel_scale(view))[
+        :3
+    ]
+
+
+def poses_from_matches(
+    object_map: ObjectMap, camera: Camera, keypoints: Keypoints, others: Sequence[Keyframe], scale: float
+) -> list[tuple[Pose, FollowedPoints]]:
+    """Poses from the matches with one keyframe each, most inliers first.
+
+    Args:
+        object_map: The map.
+        camera: The camera of the full frame.
+        keypoints: The frame's keypoints.
+        others: The keyframes.
+        scale: See `pixel_scale`.
+    """
+    found = []
+    for other in others:
+        pairs = match(keypoints, other.keypoints)
+        names = other.keypoint_landmark[pairs[:, 1]]
+        sound = (names >= 0) & ~object_map.candidate[names]
+        points = FollowedPoints(names[sound], keypoints.pixel[pairs[sound, 0]])
+        pose = pose_of_points(object_map, camera, points, scale)
+        if pose is not None:
+            found.append(pose)
+    found.sort(key=lambda one: -len(one[1]))
+    return found
+
+
+# Relocalization of a lost object in the whole frame, by keypoints matched with the keyframes'.
+#
+# After the object has left or is occluded, a mask tracker's mask says nothing about where it reappears.
+
+_MAX_KEYPOINTS = 1500  # most keypoints of a whole frame
+_MOST_KEYFRAMES_MATCHED = 24  # most keyframes that they are matched with
+_MIN_INLIERS = 10  # fewest inliers of one keyframe; matches with another object hardly ever have as many
+
+
+def relocalize_in_frame(
+    object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], last: Pose
+) -> tuple[Pose, FollowedPoints] | None:
+    """The pose with most inliers among the frame's keypoints, and the inliers; None if there are too few.
+
+    Args:
+        object_map: The map.
+        camera: The camera of the full frame.
+        image: ``(H, W)`` grey.
+        last: A pose from before the loss; the object is searched at about its size there.
+    """
+    box = projected_box(object_map.vertices, camera, last)
+    if box is None or not object_map.keyframes:
+        return None
+    length = max(box[2], box[3])
+    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MAX_KEYPOINTS)
+    count = len(object_map.keyframes)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_KEYFRAMES_MATCHED)).round().astype(int))
+    views = [object_map.keyframes[position] for position in chosen]
+    found = poses_from_matches(object_map, camera, keypoints, views, max(1.0, length / 200))
+    return found[0] if found and len(found[0][1]) >= _MIN_INLIERS else None
+
+
+def overlaps_mask(silhouette: NDArray[np.bool_], mask: NDArray[np.bool_]) -> bool:
+    """Whether a mask overlaps the relocalized object: then it counts as any other mask does."""
+    either = int(np.count_nonzero(silhouette | mask))
+    return int(np.count_nonzero(silhouette & mask)) > ELSEWHERE * either

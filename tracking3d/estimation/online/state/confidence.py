@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.optimization.observability import least_constrained_axis
+from tracking3d.estimation.estimate import Assessment, Status
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.optimization.pose_refinement import least_constrained_axis
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
+from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.frames import TRACKED_CONFIDENCE
 
 ENOUGH_POINTS = 15
@@ -250,3 +251,31 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
         return f"the object has {found}: its rotation is poorly constrained"
     axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCandidate:
+    """The result of estimating the object's pose in a frame."""
+
+    view: Keyframe  # the frame
+    fit: PoseFit  # the pose and its losses
+    hypothesis: str  # the name of the winning hypothesis
+    points: FollowedPoints  # the pose's inliers
+    evidence: PoseEvidence  # the evidence for the pose apart from its losses
+    assessment: Assessment  # the pose's assessment
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose is rejected."""
+        return self.assessment.status is Status.LOST
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the object is lost or the confidence is low."""
+        return self.assessment.confidence < TRACKED_CONFIDENCE
+
+    def better_than(self, other: PoseCandidate) -> bool:
+        """Whether it has more inliers and a lower rendering cost; any pose is better than none."""
+        return other.lost or (
+            self.evidence.inliers > other.evidence.inliers and self.fit.appearance < other.fit.appearance
+        )

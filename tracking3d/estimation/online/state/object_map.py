@@ -86,7 +86,7 @@ class ObjectMap:
 
     @cached_property
     def landmark_scene(self) -> LandmarkScene:
-        """Surface and keyframes for dense landmarks; see `tracking3d.estimation.online.mapping.keyframe_views`.
+        """Surface and keyframes for dense landmarks; see `tracking3d.estimation.online.mapping.keyframe_insertion`.
 
         Its views are drawn, and written here, when they are first needed: most never are, since each new keyframe makes
         another map.

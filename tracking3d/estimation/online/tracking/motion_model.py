@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.online.mapping.local_mapping import project_points
-from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle

@@ -86,7 +86,7 @@ def score_answers(
 
 def _read_options(items: list[str] | None) -> dict[str, Any]:
     """Read ``KEY=VALUE`` items; a value is YAML."""
-    from tracking3d.config.yaml_files import parse_yaml
+    from tracking3d.config.loading import parse_yaml
 
     pairs = [item.partition("=") for item in items or ()]
     for key, equals, value in pairs:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import AsJson, Debug, Quiet, configure
-from tracking3d.cli.options.general import Sequences
-from tracking3d.cli.options.panels import DATA
+from tracking3d.cli.options.general import DATA, Sequences
 from tracking3d.errors import InputError
 from tracking3d_bench.cli.evaluate.options import Data, Jobs, Masks, Out
 

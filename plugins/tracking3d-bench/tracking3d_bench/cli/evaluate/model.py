@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from tracking3d.cli.options import AsJson, Debug
-from tracking3d.cli.options.panels import DATA
+from tracking3d.cli.options.general import DATA
 from tracking3d.errors import InputError
 
 _COLUMNS = {

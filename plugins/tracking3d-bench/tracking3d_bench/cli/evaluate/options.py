@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+from tracking3d.cli.options.general import DATA, OUTPUT, PERFORMANCE
 
 Data = Annotated[
     Path | None,

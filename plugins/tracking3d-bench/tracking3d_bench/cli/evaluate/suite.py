@@ -9,7 +9,7 @@ import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure
 from tracking3d.cli.options.general import Sequences
-from tracking3d.cli.options.performance import Address
+from tracking3d.cli.options.output import Address
 from tracking3d_bench.cli.evaluate.options import Data, Jobs, Masks, Out, name_of_settings
 from tracking3d_bench.cli.fresh import Count, Meshes, draw_suite
 

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import AsJson, ConfigFile, Debug, Overrides, Preset, Quiet, configure
-from tracking3d.cli.options.general import Sequences
-from tracking3d.cli.options.panels import DATA, OUTPUT
-from tracking3d.cli.options.performance import Address
+from tracking3d.cli.options.general import DATA, OUTPUT, Sequences
+from tracking3d.cli.options.output import Address
 from tracking3d.errors import InputError
 from tracking3d_bench.cli.evaluate.options import Data, Jobs, Masks, Out, name_of_settings
 

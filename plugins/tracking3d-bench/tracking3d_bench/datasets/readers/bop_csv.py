@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.rigid import nearest_rigid
+from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d_bench.datasets.answers import Answers
 from tracking3d_bench.datasets.readers.text_files import read_text
 from tracking3d_bench.datasets.truth import Truth

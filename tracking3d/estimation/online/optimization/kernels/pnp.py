@@ -16,13 +16,9 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     to_camera,
 )
 from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
-from tracking3d.estimation.online.optimization.pnp_types import (
-    CONVERGED,
-    FIRST_DAMPING,
-    MOST_DAMPING,
-    PnPFit,
-    PointEquations,
-)
+from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
+from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
 from tracking3d.rendering.kernels.compilation import kernel
 
 

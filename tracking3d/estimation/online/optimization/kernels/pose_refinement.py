@@ -27,27 +27,24 @@ from tracking3d.estimation.online.optimization.types import (
     PoseWeights,
 )
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
-from tracking3d.rendering.kernels.compilation import kernel, record
-from tracking3d.rendering.kernels.pose_inputs import (
-    MATCHES,
-    SCALES,
-    SURFACE,
-    TARGET,
-    LossScales,
-    drawing_buffers,
-    packed,
-)
+from tracking3d.rendering.kernels.compilation import kernel, record, share
 from tracking3d.rendering.kernels.pose_terms import (
     APPEARANCE,
     BOTH,
     COMPARABLE,
     EITHER,
     KNOWN,
+    MATCHES,
     OUTLINE,
     POINTS,
+    SCALES,
+    SURFACE,
+    TARGET,
+    LossScales,
+    drawing_buffers,
+    packed,
     terms_of_pose,
 )
-from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.pose_comparison import NEAREST_POINT, check_comparison
 
 _COST, _APPEARANCE, _OUTLINE, _POINTS, _OVERLAP, _UNSEEN = range(6)
