@@ -62,6 +62,7 @@ ROOM_LINES = {
     "report": 1800,
     "results": 5350,
     "runtime": 1100,
+    "scene": 100,
     "segmentation": 2150,
     "submaps": 2200,
     "synthesis": 600,
@@ -80,7 +81,7 @@ LOOSE_MODULES = {"__init__", "__main__", "errors", "frames"}
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
     {"engines", "errors", "frames", "web"},
-    {"bundle_adjustment", "calibration", "config", "geometry", "points", "rendering", "runtime"},
+    {"bundle_adjustment", "calibration", "config", "geometry", "points", "rendering", "runtime", "scene"},
     {"features", "networks", "plugins", "prompts", "segmentation", "trackers", "video"},
     {"estimation", "modules", "testing"},
     {"checkpoint", "results"},
@@ -255,13 +256,29 @@ def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
 def test_segmentation_does_without_solvers_and_runs():
     for path in (PACKAGE / "segmentation").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"frames", "geometry", "rendering", "runtime", "segmentation", "trackers"}, path
+        assert rooms <= {"frames", "geometry", "rendering", "runtime", "scene", "segmentation", "trackers"}, (
+            path
+        )
 
 
 def test_points_are_followed_by_surface_and_images_alone():
     for path in (PACKAGE / "points").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"bundle_adjustment", "errors", "geometry", "points", "rendering", "runtime"}, path
+        assert rooms <= {
+            "bundle_adjustment",
+            "errors",
+            "geometry",
+            "points",
+            "rendering",
+            "runtime",
+            "scene",
+        }, path
+
+
+def test_scenes_are_views_and_surfaces_alone():
+    for path in (PACKAGE / "scene").rglob("*.py"):
+        rooms = {name.split(".")[1] for name in imported_modules(path)}
+        assert rooms <= {"errors", "frames", "geometry", "rendering", "scene"}, path
 
 
 def test_the_solvers_are_tenants_that_never_import_each_other():

@@ -26,10 +26,10 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
+from tracking3d.scene.view import crop_window
 from tracking3d.segmentation.frame_window import Answered
 from tracking3d.segmentation.temporal_neighbours import REACH
 from tracking3d.segmentation.whole_video import PixelEvidence, VideoSegmenter
-from tracking3d.trackers.crops import crop_window
 
 PIXELS = 400
 """Of a frame, at most; three in four of them near an outline."""

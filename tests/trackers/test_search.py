@@ -7,8 +7,9 @@ import pytest
 from moving_shape import SIZE, iou, moving_shape
 
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import crop_window
 from tracking3d.trackers.colour_models import GlobalColours, lab
-from tracking3d.trackers.crops import crop_window, paste_mask
+from tracking3d.trackers.crops import paste_mask
 from tracking3d.trackers.outline import both_sides
 from tracking3d.trackers.segmentation import find_by_colours
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from moving_shape import SIZE, box_around, iou, moving_shape
 
+from tracking3d.scene.view import crop_window
 from tracking3d.trackers.background import BackgroundMemory
-from tracking3d.trackers.crops import crop_window
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.segmentation import ColourSegmentation
 

@@ -123,18 +123,20 @@ class Camera:
 
 @dataclass(frozen=True)
 class Window:
-    """A square region of the frame seen at ``size`` x ``size`` pixels; it may reach beyond the frame.
+    """A region of the frame seen at other pixels, square or not; it may reach beyond the frame.
 
     Attributes:
         left, top: Outer edge of the region: the column and row of its first pixel in the frame.
-        side: Side of the region in frame pixels.
-        size: Side in window pixels.
+        side: Width of the region in frame pixels; of a square one its side.
+        size: The same in window pixels.
+        rows: Height of the region in frame pixels and in window pixels, if it is not square.
     """
 
     left: int
     top: int
     side: int
     size: int
+    rows: tuple[int, int] | None = None
 
     @classmethod
     def around(cls, box: tuple[float, float, float, float], margin: float, size: int) -> Window:
@@ -145,19 +147,34 @@ class Window:
 
     @property
     def scale(self) -> float:
-        """Window pixels per frame pixel."""
+        """Window pixels per frame pixel, along a row."""
         return self.size / self.side
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Height and width of the region in frame pixels."""
+        return self.side if self.rows is None else self.rows[0], self.side
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(h, w)``, height and width in window pixels."""
+        return self.size if self.rows is None else self.rows[1], self.size
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """``(2,)`` window pixels per frame pixel, along a row and along a column."""
+        return np.array([self.scale, self.shape[0] / self.sides[0]])
 
     def K(self, camera: Camera) -> NDArray[np.float64]:
         """``(3, 3)`` intrinsics of ``camera`` in this window's pixels.
 
         Pixel centres are at integers in both grids, so ``u_window = (u + 0.5 - left) * scale - 0.5``.
         """
-        s = self.scale
+        sx, sy = self.scales
         return np.array(
             [
-                [s * camera.fx, 0.0, (camera.cx + 0.5 - self.left) * s - 0.5],
-                [0.0, s * camera.fy, (camera.cy + 0.5 - self.top) * s - 0.5],
+                [sx * camera.fx, 0.0, (camera.cx + 0.5 - self.left) * sx - 0.5],
+                [0.0, sy * camera.fy, (camera.cy + 0.5 - self.top) * sy - 0.5],
                 [0.0, 0.0, 1.0],
             ]
         )
@@ -165,6 +182,6 @@ class Window:
     @property
     def to_frame(self) -> NDArray[np.float64]:
         """``(3, 3)`` from this window's pixels, homogeneous, to the frame's."""
-        step = 1 / self.scale
-        first = 0.5 * step - 0.5
-        return np.array([[step, 0.0, self.left + first], [0.0, step, self.top + first], [0.0, 0.0, 1.0]])
+        across, down = 1 / self.scales
+        first = self.left + (0.5 * across - 0.5), self.top + (0.5 * down - 0.5)
+        return np.array([[across, 0.0, first[0]], [0.0, down, first[1]], [0.0, 0.0, 1.0]])

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.points.outline_fit import depth_inside
-from tracking3d.trackers.crops import box_of, crop_window, inside_frame
+from tracking3d.scene.view import crop_window, inside_frame
+from tracking3d.trackers.crops import box_of
 
 SIDE = 192
 """Pixels of a view's side; a smaller window is seen larger."""

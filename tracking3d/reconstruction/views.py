@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
-from tracking3d.trackers.crops import box_of, crop_window, inside_frame
+from tracking3d.scene.view import crop_window, inside_frame
+from tracking3d.trackers.crops import box_of
 
 _MARGIN = 0.05  # around the mask, relative to its longer side
 _LARGEST = 640  # pixels of a view's side; a larger window is seen smaller

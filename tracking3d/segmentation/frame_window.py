@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.rendering.visibility import NEAR, rasterize
-from tracking3d.trackers.crops import box_of, crop_window, inside_frame
+from tracking3d.scene.view import crop_window, inside_frame
+from tracking3d.trackers.crops import box_of
 
 LARGEST = 320
 """Pixels of a window's side; a larger one is seen smaller."""

@@ -1,4 +1,4 @@
-"""Square crops of a frame at a fixed working size, and back."""
+"""Masks of crops pasted into frames, and boxes."""
 
 from __future__ import annotations
 
@@ -9,37 +9,6 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Window
-
-
-def crop_window(image: NDArray, window: Window) -> NDArray:
-    """What ``window`` sees of ``image`` ``(H, W)`` or ``(H, W, C)``, resampled to ``(size, size[, C])``.
-
-    The part of the window beyond the frame repeats the frame's border. A mask becomes float32.
-    """
-    rows, above, below = _span(window.top, window.side, image.shape[0])
-    columns, before, after = _span(window.left, window.side, image.shape[1])
-    region = image[rows, columns]
-    if region.dtype == np.bool_:
-        region = region.astype(np.float32)
-    if above or below or before or after:
-        region = cv2.copyMakeBorder(region, above, below, before, after, cv2.BORDER_REPLICATE)
-    method = cv2.INTER_AREA if window.size < window.side else cv2.INTER_LINEAR
-    return cv2.resize(region, (window.size, window.size), interpolation=method)
-
-
-def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
-    """What of ``count`` places from ``first`` on lies in ``range(size)``, one at least; how many before and after."""
-    begin, end = min(max(first, 0), size - 1), max(min(first + count, size), 1)
-    end = max(end, begin + 1)
-    before = min(max(-first, 0), count - 1)
-    return slice(begin, end), before, count - (end - begin) - before
-
-
-def inside_frame(shape: tuple[int, ...], window: Window) -> NDArray[np.bool_]:
-    """``(size, size)``: which pixels of ``window`` lie inside a frame of ``shape`` ``(H, W, ...)``."""
-    centres = (np.arange(window.size) + 0.5) / window.scale
-    rows, columns = window.top + centres, window.left + centres
-    return ((rows > 0) & (rows < shape[0]))[:, None] & ((columns > 0) & (columns < shape[1]))
 
 
 def paste_mask(mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]) -> NDArray[np.float32]:

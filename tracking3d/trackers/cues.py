@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.frames import Box, Image
+from tracking3d.frames import Box
 from tracking3d.geometry.camera import Window
-from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
-from tracking3d.trackers.crops import crop_window, inside_frame
+from tracking3d.scene.view import FrameCrop
+from tracking3d.trackers.colour_models import GlobalColours, Palette
 from tracking3d.trackers.mask_motion import MaskMotion
 from tracking3d.trackers.outline import prior, shift_to
 
@@ -55,27 +55,6 @@ class Cues:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class FrameCrop:
-    """A frame seen through a square window."""
-
-    window: Window  # the window
-    image: NDArray[np.uint8]  # (S, S, 3) RGB
-    colours: NDArray[np.uint8]  # (S, S, 3) Lab
-    in_frame: NDArray[np.bool_]  # (S, S) bool, what is not beyond the frame
-
-    @classmethod
-    def of(cls, frame: Image, window: Window) -> Self:
-        """See ``frame`` ``(H, W, 3)`` RGB through ``window``."""
-        image = crop_window(frame, window)
-        return cls(window, image, lab(image), inside_frame(frame.shape, window))
-
-    @property
-    def grey(self) -> NDArray[np.uint8]:
-        """``(S, S)``."""
-        return cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)
-
-
 def colour_and_motion(
     last: FrameCrop,
     present: FrameCrop,
@@ -85,14 +64,14 @@ def colour_and_motion(
     cues: Cues,
 ) -> NDArray[np.float32]:
     """``(S, S)`` log-odds of the object by how pixels look and move."""
-    evidence = cues.global_colours * colours.log_ratio(present.colours) + cues.motion * motion.cue
+    evidence = cues.global_colours * colours.log_ratio(present.lab) + cues.motion * motion.cue
     if cues.local_colours == 0:  # they take a good part of the time
         return evidence
     last_labels = cv2.remap(
-        palette.label(last.colours), motion.source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        palette.label(last.lab), motion.source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
     )
     radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(motion.moved))), 1)
-    labels = palette.label(present.colours)
+    labels = palette.label(present.lab)
     return evidence + cues.local_colours * palette.local_log_ratio(
         labels, last_labels, motion.by_flow, radius
     )

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.trackers.colour_models import lab
-from tracking3d.trackers.crops import clip_box, crop_window, inside_frame, paste_mask
+from tracking3d.trackers.crops import clip_box, paste_mask
 
 _SIZE = 288
 _MARGIN = 0.35

@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import dijkstra
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.trackers.colour_models import lab
-from tracking3d.trackers.crops import box_of, crop_window, inside_frame, paste_mask
+from tracking3d.trackers.crops import box_of, paste_mask
 
 Points = NDArray[np.float32]
 """``(N, 3)``: x, y in pixels of the image, and 1 for the object or 0 for the background."""

@@ -20,19 +20,12 @@ from numpy.typing import NDArray
 from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import FrameCrop, crop_window, inside_frame
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import (
-    box_iou,
-    box_of,
-    clip_box,
-    crop_window,
-    inside_frame,
-    outside,
-    paste_mask,
-)
-from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, outside, paste_mask
+from tracking3d.trackers.cues import Cues, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
@@ -115,11 +108,11 @@ class ColourSegmentation:
         self._usual_area = float(np.count_nonzero(self._mask > 0.5))
         view = FrameCrop.of(image, Window.around(box_of(self._mask) or box, _MARGIN, size))
         inside, around = both_sides(crop_window(self._mask, view.window))
-        self._colours = GlobalColours(view.colours, inside, around)
-        self._palette = Palette(view.colours)
+        self._colours = GlobalColours(view.lab, inside, around)
+        self._palette = Palette(view.lab)
         beside = both_sides(mask)[1] if mask is not None else outside(box, image.shape, _SLACK)
         self._background = BackgroundMemory(image, beside)
-        self._first_separation = self._colours.separation(view.colours, inside, around)
+        self._first_separation = self._colours.separation(view.lab, inside, around)
         self._judgement = Judgement(self._first_separation, margin=self._first_separation)
 
     @property
@@ -140,7 +133,7 @@ class ColourSegmentation:
         self._image, self._mask, self._doubtful_frames = image, mask.astype(np.float32), 0
         if box is not None:
             view = FrameCrop.of(image, Window.around(box, _MARGIN, self._size))
-            self._colours.update(view.colours, *both_sides(crop_window(self._mask, view.window)))
+            self._colours.update(view.lab, *both_sides(crop_window(self._mask, view.window)))
             self._background.forget(mask)
 
     def step(self, image: Image, tracked_box: Box | None = None) -> MaskEstimate:
@@ -206,7 +199,7 @@ class ColourSegmentation:
         if believed:
             self._usual_area = self._usual_area if at_border else frame_area
             _, around = _sides(mask, present)
-            self._colours.update(present.colours, mask, around)
+            self._colours.update(present.lab, mask, around)
             far = inside_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
             self._learn_background(image, present, around, np.where(far, 1, -motion.cue / _PARTED))
         full = paste_mask(mask, present.window, image.shape)
@@ -232,7 +225,7 @@ class ColourSegmentation:
         """The cues' weights in a frame: a network knows less than colours that are the object's alone."""
         if self._network is None:
             return self._cues
-        median = float(np.median(self._colours.log_ratio(present.colours)[moved]))
+        median = float(np.median(self._colours.log_ratio(present.lab)[moved]))
         none, full = _SEPARATING
         return self._cues.favour_colours(min(max((median - none) / (full - none), 0.0), 1.0))
 
@@ -266,7 +259,7 @@ class ColourSegmentation:
             self._background.learn(image, view.window, around, proof.astype(np.float32))
 
     def _separation(self, view: FrameCrop, mask: NDArray) -> float:
-        return self._colours.separation(view.colours, *_sides(mask, view))
+        return self._colours.separation(view.lab, *_sides(mask, view))
 
 
 def _is_textured(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:

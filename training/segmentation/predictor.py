@@ -17,9 +17,9 @@ from network import CHANNELS, SIZE
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
+from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.colour_models import GlobalColours
-from tracking3d.trackers.crops import box_of, clip_box, crop_window
-from tracking3d.trackers.cues import FrameCrop
+from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.mask_motion import follow_mask
 from tracking3d.trackers.outline import both_sides
 
@@ -77,7 +77,7 @@ class Predictor:
         window = Window.around(box_of(carried) or box, _MARGIN, SIZE)
         channels = _rgb(image, window)
         channels[3] = crop_window(carried, window)
-        channels[4] = self._colours.log_ratio(FrameCrop.of(image, window).colours) / LOG_LIMIT
+        channels[4] = self._colours.log_ratio(FrameCrop.of(image, window).lab) / LOG_LIMIT
         channels[5] = crop_window(cue, window) / CUE_LIMIT
         channels[7] = 1
         object_, occluder = (_pasted(one, window, image.shape) for one in self._run(channels))
@@ -95,9 +95,9 @@ class Predictor:
         view = FrameCrop.of(image, Window.around(box, _FLOW_MARGIN, _FLOW_SIZE))
         inside, around = both_sides(crop_window(mask, view.window))
         if self._colours is None:
-            self._colours = GlobalColours(view.colours, inside, around & view.in_frame)
+            self._colours = GlobalColours(view.lab, inside, around & view.in_frame)
         else:
-            self._colours.update(view.colours, inside, around & view.in_frame)
+            self._colours.update(view.lab, inside, around & view.in_frame)
 
 
 def _rgb(image: Image, window: Window) -> Map:

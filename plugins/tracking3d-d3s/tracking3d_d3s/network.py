@@ -19,7 +19,8 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, crop_window, inside_frame, paste_mask
+from tracking3d.scene.view import crop_window, inside_frame
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, paste_mask
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
 
 _INPUTS = {"train_imgs": 3, "test_imgs": 3, "train_masks": 1, "test_dist": 1}

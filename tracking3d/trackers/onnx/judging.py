@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.confidence import Judgement, inside_distance, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, crop_window, inside_frame
+from tracking3d.trackers.crops import box_iou, box_of
 from tracking3d.trackers.onnx.images import Proposal, enlarge
 
 _MARGIN, _SIZE = 0.45, 160  # of the crops that colours are taken from

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
+from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.colour_models import GlobalColours
-from tracking3d.trackers.crops import box_of, clip_box, crop_window
-from tracking3d.trackers.cues import FrameCrop
+from tracking3d.trackers.crops import box_of, clip_box
 
 Map = NDArray[np.float32]
 """``(S, S)`` of a square crop."""
@@ -112,7 +112,7 @@ class ObjectNetwork:
         channels = [_image_channels(crops[0]), _box_channels(crops[1], box)]
         by_mask = crops[0].window
         channels[0][_MASK] = _resample(carried, window, by_mask)
-        channels[0][_COLOURS] = colours.log_ratio(crops[0].colours) / _COLOUR_SCALE
+        channels[0][_COLOURS] = colours.log_ratio(crops[0].lab) / _COLOUR_SCALE
         channels[0][_MOTION] = _resample(motion, window, by_mask) / _MOTION_SCALE
         channels[0][_HAS_COLOURS] = 1
         objects, occluders = (

@@ -14,10 +14,11 @@ from pydantic import BaseModel, Field
 from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Window
+from tracking3d.scene.view import FrameCrop
 from tracking3d.trackers.box_trackers import BoxOffset, Lookahead
 from tracking3d.trackers.colour_models import GlobalColours
 from tracking3d.trackers.crops import box_of, check_box_in_frame, paste_mask
-from tracking3d.trackers.cues import Cues, FrameCrop
+from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.trackers.mask_motion import MaskMotion
 from tracking3d.trackers.opencv_build import why_no_contrib

@@ -17,6 +17,7 @@ from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Window
 from tracking3d.geometry.pose import Pose
+from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.segmentation import (
     ColourModels,
     as_lab,
@@ -37,7 +38,6 @@ from tracking3d.segmentation.online_motion_cue import (
     online_motion_log_odds,
     unlike_surroundings,
 )
-from tracking3d.trackers.crops import crop_window, inside_frame
 
 _DISPUTED = 0.5
 """See `tracking3d.segmentation.in_question`: if both outlines nearly agree, as exact masks do, nothing is missing that
