@@ -8,7 +8,8 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.points.landmark_adjustment import move_surface
 from tracking3d.points.ray_intersection import surface_under
-from tracking3d.points.view import open_view, sample
+from tracking3d.points.view import open_view
+from tracking3d.scene.surface import sample
 
 MESH = sphere(8)
 CAMERA = Camera(900.0, 900.0, 319.5, 239.5, 640, 480)

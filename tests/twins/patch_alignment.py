@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.points.view import Array, Plane
 from tracking3d.points.warping import LEAST_COVER, NOISE, RADIUS, STEPS, Alignment, _window
+from tracking3d.scene.view import Array, Plane
 
 
 def align(template: Plane, weight: Plane, image: Plane, xy: Array, prior: float = 1.0) -> Alignment:

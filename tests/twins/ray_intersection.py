@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tracking3d.points.robust_bundle import _AHEAD, _OUTLIER, TURNS
-from tracking3d.points.view import Array
+from tracking3d.scene.view import Array
 
 
 def intersect(

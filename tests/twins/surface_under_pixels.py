@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.rendering.visibility import NEAR
+from tracking3d.geometry.camera import NEAR
 
 _EDGE = 1e-9  # barycentric slack, so that a ray through an edge does not slip between two faces
 _CHUNK = 256  # points met with all faces at once

@@ -5,11 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tracking3d.points.view import Plane, SurfaceView
 from tracking3d.points.warping import _BEYOND
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import Plane
 
 
-def warped(source: SurfaceView, target: SurfaceView, tolerance: float) -> tuple[Plane, Plane]:
+def warped(source: Drawn, target: Drawn, tolerance: float) -> tuple[Plane, Plane]:
     """See `tracking3d.points.warping._warp`."""
     near = (target.beyond < _BEYOND) & (target.inverse_depth > 0)
     rows, columns = np.nonzero(near)

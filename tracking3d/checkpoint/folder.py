@@ -26,7 +26,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import link_or_copy, read_mask, write_atomic, write_mask, writing
 from tracking3d.results.run_reader import FormatError
 
-VERSION = 2
+VERSION = 3
 MOST_KEPT = 100 * 10**6
 """Bytes that rollback points may take in the folder of a run that is finished."""
 

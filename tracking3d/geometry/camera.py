@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from tracking3d.geometry.lens import Lens
 
+NEAR = 1e-3
+"""Depth in object units from which on a point has an image; faces with a nearer vertex are not drawn."""
+
 DEFAULT_FIELD_OF_VIEW = 45.0
 """Vertical field of view in degrees when nothing better is known (paper section 3.2)."""
 

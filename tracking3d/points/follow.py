@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.robust_bundle import intersect
 from tracking3d.points.track_chaining import Chain, follow_chain
-from tracking3d.points.view import Array, SurfaceView, sample
+from tracking3d.scene.surface import Drawn, sample
+from tracking3d.scene.view import Array
 
 RIM = 3.0
 """Pixels beside the drawn surface that are still on its rim."""
@@ -83,7 +84,7 @@ def follow_points(scene: LandmarkScene, start: int, xy: Array) -> Followed:
 
 
 def combine_with_images(
-    views: list[SurfaceView], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
+    views: list[Drawn], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
 ) -> Followed:
     """Surface points brought together with what the images say of them.
 
@@ -113,7 +114,7 @@ def combine_with_images(
         slant=slant,
         gap=gap,
     )
-    scales = np.stack([one.scale.mean() for one in views])[:, None]
+    scales = np.stack([one.window.scales.mean() for one in views])[:, None]
     positions = np.stack(
         [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]
     )
@@ -128,7 +129,7 @@ def combine_with_images(
 
 
 def _landmarks(
-    views: list[SurfaceView], points: Array, measured: Array, variance: Array, held: float
+    views: list[Drawn], points: Array, measured: Array, variance: Array, held: float
 ) -> tuple[Array, Array]:
     """Points moved to where all views see them, and the share of its weight that each measurement kept."""
     deviation = np.sqrt(variance + _DEVIATION**2)

@@ -23,8 +23,8 @@ from tracking3d.points.pictures import (
     patches,
     placement_variance,
 )
-from tracking3d.points.view import Array
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.view import Array
 
 _WINDOW = (17, 17)
 _LEVELS = 4  # halvings of the picture

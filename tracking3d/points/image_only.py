@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tracking3d.points.image_following import ImageAnswers, ImageFollower
 from tracking3d.points.online import KEPT, PointAnswers
 from tracking3d.points.pictures import Picture
-from tracking3d.points.view import Array
+from tracking3d.scene.view import Array
 
 
 class UncoveredPoints:

@@ -24,9 +24,11 @@ from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.robust_bundle import bundle, other_way_round
 from tracking3d.points.track_chaining import follow_chain
-from tracking3d.points.view import Array, SurfaceView, redraw_surface
+from tracking3d.points.view import redraw_surface
 from tracking3d.points.warping import Warps
 from tracking3d.runtime.progress import report_progress
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import Array
 
 ROUNDS = 6
 START_VIEWS = 8
@@ -64,7 +66,7 @@ class LandmarkSupport:
 class LandmarkScene:
     """A rigid surface in T views."""
 
-    views: list[SurfaceView | None]  # none if the object was not found
+    views: list[Drawn | None]  # none if the object was not found
     vertices: Array  # (V, 3) in object coordinates
     faces: NDArray[np.int64]  # (F, 3)
     focal_factor: float = 1.0  # by which the views' focal lengths are those that they were opened with
@@ -101,13 +103,11 @@ class LandmarkScene:
         self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0
     ) -> LandmarkScene:
         """The same views with another surface in other poses, by index of the view, with another focal length."""
-        lens = np.array([focal_factor, focal_factor, 1.0, 1.0])
+        lens = np.diag([focal_factor, focal_factor, 1.0])
         views = [
             None
             if view is None
-            else redraw_surface(
-                replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index]
-            )
+            else redraw_surface(replace(view, K=view.K @ lens), vertices, self.faces, poses[index])
             for index, view in enumerate(self.views)
         ]
         return replace(
@@ -330,7 +330,7 @@ def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
     return np.sort(np.array(chosen))
 
 
-def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> Corners:
+def seeds(view: Drawn, vertices: Array, faces: NDArray[np.int64]) -> Corners:
     """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
     ``(N, 2)`` of each.
     """
@@ -396,7 +396,7 @@ TURNS = 2
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tuple[SurfaceView, float]:
+def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Drawn, float]:
     """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
 
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.

@@ -19,8 +19,10 @@ from tracking3d.points.follow import RIM, combine_with_images
 from tracking3d.points.landmark_adjustment import TOLERANCE
 from tracking3d.points.robust_bundle import bundle
 from tracking3d.points.track_chaining import STEPS, Chain, extend
-from tracking3d.points.view import Array, SurfaceView, redraw_surface, sample
+from tracking3d.points.view import redraw_surface
 from tracking3d.points.warping import Warps
+from tracking3d.scene.surface import Drawn, sample
+from tracking3d.scene.view import Array
 
 KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
@@ -42,7 +44,7 @@ class _Row:
     """What is known of N points in one view; see `Chain`."""
 
     index: int
-    view: SurfaceView | None
+    view: Drawn | None
     measured: Array
     variance: Array
     likeness: Array
@@ -61,7 +63,7 @@ class CausalPoints:
         self._rows: list[_Row] = []
         self._first: _Row | None = None
 
-    def step(self, index: int, view: SurfaceView | None, radius: float) -> PointAnswers:
+    def step(self, index: int, view: Drawn | None, radius: float) -> PointAnswers:
         """The estimates for the next frame; the first one is the query frame.
 
         Args:
@@ -105,7 +107,7 @@ class CausalPoints:
             T_cam_obj = view.T_cam_obj
             if better is not None:
                 camera, T_cam_obj = better
-                view = replace(view, intrinsics=view.intrinsics_of(camera))
+                view = replace(view, K=view.window.K(camera))
             row.view = redraw_surface(view, vertices, faces, T_cam_obj)
 
     def again(self, radius: float) -> dict[int, PointAnswers]:
@@ -188,7 +190,7 @@ class CausalPoints:
         )
 
 
-def _adjust_bundle(views: list[SurfaceView], points: Array, chain: Chain, radius: float) -> list[SurfaceView]:
+def _adjust_bundle(views: list[Drawn], points: Array, chain: Chain, radius: float) -> list[Drawn]:
     """The views in poses that agree with what the images say of the points; as they are drawn otherwise."""
     intrinsics, poses = (
         np.stack([one.intrinsics for one in views]),
@@ -201,7 +203,7 @@ def _adjust_bundle(views: list[SurfaceView], points: Array, chain: Chain, radius
     return [replace(one, T_cam_obj=T) for one, T in zip(views, poses, strict=True)]
 
 
-def _grid(view: SurfaceView) -> Array:
+def _grid(view: Drawn) -> Array:
     """``(N, 2)`` pixels of the frame, all over the object."""
     height, width = view.beyond.shape
     steps = (np.arange(_GRID) + 0.5) / _GRID

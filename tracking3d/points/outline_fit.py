@@ -17,9 +17,9 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
 from tracking3d.geometry.pixel_distance import pixel_distance
-from tracking3d.points.view import SurfaceView
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
+from tracking3d.scene.surface import Drawn
 
 STEPS = 3
 SCALE = 1.5
@@ -58,17 +58,16 @@ class Outline:
     T_cam_obj: NDArray[np.float64]
 
 
-def outline_of(view: SurfaceView) -> Outline:
+def outline_of(view: Drawn) -> Outline:
     """What the mask of a view says of the outline.
 
     A window ends that near to the object only where the frame does.
     """
     height, width = view.mask.shape
-    fx, fy, cx, cy = view.intrinsics
     return Outline(
         depth_inside(view.mask > 0.5),
         np.array([-0.5, width - 0.5, -0.5, height - 0.5], np.float32),
-        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        view.K,
         view.T_cam_obj,
     )
 

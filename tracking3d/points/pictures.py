@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.points.view import Array, sample
+from tracking3d.scene.surface import sample
+from tracking3d.scene.view import Array
 
 Grey = NDArray[np.uint8]
 Patches = NDArray[np.float32]

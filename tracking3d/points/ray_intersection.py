@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.rendering.visibility import NEAR
+from tracking3d.geometry.camera import NEAR
 
 _EDGE = 1e-9  # barycentric slack, so that a ray through an edge does not slip between two faces
 _SLACK = 1e-4  # pixels; more than the barycentric slack is on the screen, on faces up to 100,000 pixels long

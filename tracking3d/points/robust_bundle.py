@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.bundle_adjustment.adjustment import Reversal, reversal_of
 from tracking3d.geometry.camera import LENS_KNOWN
-from tracking3d.points.view import Array
+from tracking3d.scene.view import Array
 
 TURNS = 12
 _CONVERGED = 3e-4

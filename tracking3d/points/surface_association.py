@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from tracking3d.points.follow import Followed
 from tracking3d.points.landmark_adjustment import LandmarkScene
-from tracking3d.points.view import Array, SurfaceView, sample
+from tracking3d.scene.surface import Drawn, sample
+from tracking3d.scene.view import Array
 
 _CANDIDATES = 12  # meetings of one point that are looked into
 _LEAST_SLANT = 0.3  # cosine between ray and surface; below, a pixel is many points
@@ -51,7 +52,7 @@ def meetings(
     return found
 
 
-def _surface_hits(views: list[SurfaceView], xy: Array) -> Array:
+def _surface_hits(views: list[Drawn], xy: Array) -> Array:
     """``(V, 3)`` points of the surface under one pixel ``(V, 2)`` of each view; NaN if it does not lie there."""
     points = np.full((len(views), 3), np.nan)
     for row, view in enumerate(views):
@@ -61,7 +62,7 @@ def _surface_hits(views: list[SurfaceView], xy: Array) -> Array:
     return points
 
 
-def _best(views: list[SurfaceView], xy: Array, uncertainty: Array, met: Array, radius: float) -> int | None:
+def _best(views: list[Drawn], xy: Array, uncertainty: Array, met: Array, radius: float) -> int | None:
     """Which meeting explains best where the images have the point; None if none does."""
     on = np.flatnonzero(np.isfinite(met).all(1))
     if len(on) < _LEAST_AGREEING:
@@ -82,7 +83,7 @@ def _best(views: list[SurfaceView], xy: Array, uncertainty: Array, met: Array, r
     return None if best is None else best[1]
 
 
-def _has_turned_enough(views: list[SurfaceView], point: Array) -> bool:
+def _has_turned_enough(views: list[Drawn], point: Array) -> bool:
     eyes = np.stack([-view.T_cam_obj[:3, :3].T @ view.T_cam_obj[:3, 3] for view in views]) - point
     direction = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
     return bool((direction @ direction.T).min() < _LEAST_TURN)

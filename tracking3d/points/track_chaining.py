@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.points.view import Array
 from tracking3d.points.warping import Warps
+from tracking3d.scene.view import Array
 
 STEPS = (1, 3, 7)
 """How many views back the templates are taken from; the mean of what they say, by their variances, counts."""

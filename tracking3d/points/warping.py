@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tracking3d.points.view import REACH, Array, Plane, SurfaceView
-from tracking3d.rendering.visibility import NEAR
+from tracking3d.geometry.camera import NEAR
+from tracking3d.points.view import REACH
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import Array, Plane
 
 # Aligns templates with the image around many points at once.
 #
@@ -105,7 +107,7 @@ class Warps:
         tolerance: How far behind a drawn surface a point may lie and be seen, in object units.
     """
 
-    def __init__(self, views: list[SurfaceView | None], tolerance: float) -> None:
+    def __init__(self, views: list[Drawn | None], tolerance: float) -> None:
         self.views, self.tolerance = views, tolerance
 
     def carry(self, source: int, target: int, xy: Array) -> Carried:
@@ -127,7 +129,7 @@ class Warps:
         )
 
 
-def _warp(source: SurfaceView, target: SurfaceView, tolerance: float) -> tuple[Plane, Plane]:
+def _warp(source: Drawn, target: Drawn, tolerance: float) -> tuple[Plane, Plane]:
     """The image of ``source`` as ``target`` would see it, and where it is known."""
     from tracking3d.points.kernels.warping import WarpSource, WarpTarget, warp
     from tracking3d.rendering.kernels.compilation import share

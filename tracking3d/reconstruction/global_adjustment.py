@@ -29,9 +29,10 @@ from tracking3d.points.landmark_adjustment import (
     refine_through,
     resect,
 )
-from tracking3d.points.view import LANDMARK_WINDOW, SurfaceView, open_view
+from tracking3d.points.view import LANDMARK_WINDOW, open_view
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
+from tracking3d.scene.surface import Drawn
 
 ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
@@ -69,7 +70,7 @@ class GlobalAdjustment:
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
         self._wanted = {answered[index] for index in at}
-        self._views: dict[int, SurfaceView] = {}
+        self._views: dict[int, Drawn] = {}
         self._strengths: list[float] = []
         self._scene: LandmarkScene | None = None
         self._bundled: list[int] = []
@@ -121,7 +122,7 @@ class GlobalAdjustment:
         there = sorted(self._views)
         at = np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).round().astype(int))
         self._bundled = [there[place] for place in at]
-        views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
+        views: list[Drawn | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         scene = LandmarkScene(views, self.vertices, self.faces, may_reverse=True)
         rounds = int(np.clip(_DRAWN // len(views), *ROUNDS))
@@ -208,7 +209,7 @@ class GlobalAdjustment:
         T[:3, 3] = (1 - share) * poses[0, :3, 3] + share * poses[1, :3, 3]
         return T
 
-    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> Drawn | None:
         image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
         return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LANDMARK_WINDOW)
 
@@ -264,7 +265,7 @@ class HeldAdjustment:
         for index in changed:
             self._wanted.update([one for one in kept if one < index][-NEAR:])
             self._wanted.update([one for one in kept if one > index][:NEAR])
-        self._views: dict[int, SurfaceView] = {}
+        self._views: dict[int, Drawn] = {}
         self._shares: dict[int, LandmarkSupport] = {}
         self._strengths: list[float] = []
 
@@ -320,7 +321,7 @@ class HeldAdjustment:
         """What the texture is taken from, with the pose that its frame has in the end."""
         return replace(view, T_cam_obj=record.T_cam_obj)
 
-    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> Drawn | None:
         image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
         return open_view(
             image, mask, self.camera, T_cam_obj, self.vertices_of_landmarks, self.faces, LANDMARK_WINDOW

@@ -15,13 +15,14 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.normal_equations import NormalEquations, screen_motion
 from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.surface import edges_of
 from tracking3d.rendering.surface_visibility import front_faces
 from tracking3d.rendering.texture_losses import cauchy
-from tracking3d.rendering.visibility import NEAR, expand_ranges
+from tracking3d.rendering.visibility import expand_ranges
 
 MOST_ON_AN_EDGE = 256
 """Points on one edge, however large it seems."""

@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.visibility import NEAR, expand_ranges, face_corners, gather
+from tracking3d.rendering.visibility import expand_ranges, face_corners, gather
 
 SIGMA = 7000.0
 BOXLEN = 0.02

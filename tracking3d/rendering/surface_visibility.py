@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.backprojection import TexelMap
 from tracking3d.rendering.renderer import Rendering, to_screen
-from tracking3d.rendering.visibility import NEAR
 
 DEPTH_TOLERANCE = 0.01
 """How far behind the drawn surface a point may lie and still be seen, in radii of the object."""

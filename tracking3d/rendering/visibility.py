@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.shapes import check_shapes
-
-NEAR = 1e-3
-"""Faces with a vertex nearer than this (object units, along z) are not drawn."""
 
 
 @dataclass(frozen=True, eq=False)

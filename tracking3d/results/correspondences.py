@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import NEAR, Camera
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.rendering.surface_visibility import DEPTH_TOLERANCE, deepest_around
-from tracking3d.rendering.visibility import NEAR, rasterize
+from tracking3d.rendering.visibility import rasterize
 from tracking3d.results.layout import OVERLAY
 from tracking3d.results.records import FrameRecord, jsonable
 from tracking3d.results.run_reader import RunReader

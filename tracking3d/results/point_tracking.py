@@ -24,7 +24,7 @@ from tracking3d.points.landmark_adjustment import ROUNDS, LandmarkScene, fit_out
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.surface_association import meetings, merge_image_points
-from tracking3d.points.view import SurfaceView, open_view
+from tracking3d.points.view import open_view
 from tracking3d.results import layout
 from tracking3d.results.correspondences import (
     PointKind,
@@ -40,6 +40,7 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, open_run_source
 from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.scene.surface import Drawn
 from tracking3d.video import FrameSource
 
 _LONGEST_KEY = 1024  # bytes
@@ -129,7 +130,7 @@ def open_scene(
     """
     run = run if isinstance(run, RunReader) else RunReader(run)
     vertices, faces = _surface(run)
-    images: dict[int, SurfaceView | None] = {}
+    images: dict[int, Drawn | None] = {}
     records = {one.index: one for one in run.frames}
     source = source if source is not None else open_run_source(run)
     for frame in report_each("reading frames", source, source.count):
@@ -170,7 +171,7 @@ def _view(
     image: Image,
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
-) -> SurfaceView | None:
+) -> Drawn | None:
     camera = run.camera_of(record)
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(

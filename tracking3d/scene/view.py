@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import Window
+from tracking3d.geometry.camera import NEAR, Window
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Plane = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +23,10 @@ class FrameCrop:
     """A frame seen through a window of ``(h, w)`` pixels."""
 
     window: Window  # of the frame
-    image: NDArray[Any]  # (h, w, 3) uint8 RGB
+    image: NDArray[Any]  # (h, w, 3) uint8 RGB; (h, w) grey values where points are followed
     frame_size: tuple[int, int]  # (H, W) of the frame
+    # (h, w) the object: bool; where points are followed how far, uint8 to 255 or float32 to 1. None if it is not known
+    mask: NDArray[Any] | None = None
 
     @classmethod
     def of(cls, frame: Image, window: Window) -> Self:
@@ -43,6 +47,51 @@ class FrameCrop:
     def in_frame(self) -> Mask:
         """``(h, w)`` what is not beyond the frame."""
         return inside_frame(self.frame_size, self.window)
+
+    def to_window(self, xy: Array) -> Array:
+        """Pixels ``(..., 2)`` of the frame as pixels of the window."""
+        return (xy + 0.5 - np.array([self.window.left, self.window.top])) * self.window.scales - 0.5
+
+    def to_frame(self, xy: Array) -> Array:
+        """Pixels ``(..., 2)`` of the window as pixels of the frame."""
+        return (xy + 0.5) / self.window.scales - 0.5 + np.array([self.window.left, self.window.top])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObjectView(FrameCrop):
+    """The object in a frame, seen through a window of it. All pixels are the window's; see `to_frame`."""
+
+    mask: NDArray[Any]
+    K: Array  # (3, 3) intrinsics of the window
+    T_cam_obj: Array  # (4, 4); NaN if there is no pose
+
+    @property
+    def intrinsics(self) -> Array:
+        """``(4,)`` fx, fy, cx, cy of the window."""
+        return self.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Object points ``(N, 3)`` as ``(N, 2)`` pixels, NaN behind the camera, and ``(N,)`` depths."""
+        return project_points(points, self.K, self.T_cam_obj)
+
+    def back_project(self, xy: Array, inverse_depth: NDArray[np.floating]) -> Array:
+        """Pixels ``(N, 2)`` at one over their depths ``(N,)`` as object points ``(N, 3)``; NaN if that is 0."""
+        depth = 1 / np.where(inverse_depth > 0, inverse_depth, np.nan).astype(np.float64)
+        fx, fy, cx, cy = self.intrinsics
+        seen = np.stack([(xy[:, 0] - cx) / fx * depth, (xy[:, 1] - cy) / fy * depth, depth], 1)
+        points: Array = (seen - self.T_cam_obj[:3, 3]) @ self.T_cam_obj[:3, :3]
+        return points
+
+
+def project_points(points: Array, K: Array, T_cam_obj: Array) -> tuple[Array, Array]:
+    """Object points ``(N, 3)`` as ``(N, 2)`` pixels, NaN behind the camera, and ``(N,)`` depths."""
+    seen = points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    depth = seen[:, 2]
+    with np.errstate(invalid="ignore"):
+        ahead = np.where(depth > NEAR, depth, np.nan)
+    return np.stack(
+        [K[0, 0] * seen[:, 0] / ahead + K[0, 2], K[1, 1] * seen[:, 1] / ahead + K[1, 2]], 1
+    ), depth
 
 
 def crop_window(image: NDArray, window: Window) -> NDArray:

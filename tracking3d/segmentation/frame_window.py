@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import Camera, Window
-from tracking3d.rendering.visibility import NEAR, rasterize
+from tracking3d.geometry.camera import NEAR, Camera, Window
+from tracking3d.rendering.visibility import rasterize
 from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.trackers.crops import box_of
 

@@ -35,9 +35,9 @@ from tracking3d.estimation.shape import (
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.camera import NEAR
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_angle, rotation_exponential
 from tracking3d.rendering import BackProjection, TexelMap
-from tracking3d.rendering.visibility import NEAR
 from tracking3d.runtime.stage_times import in_stage
 
 

@@ -17,7 +17,7 @@ class WarpTarget(NamedTuple):
     """The view that is written.
 
     Attributes:
-        inverse_depth, beyond, intrinsics: See `tracking3d.points.view.SurfaceView`.
+        inverse_depth, beyond, intrinsics: See `tracking3d.scene.surface.Drawn`.
         reach: Pixels beyond its outline up to which there is something.
     """
 
@@ -28,7 +28,7 @@ class WarpTarget(NamedTuple):
 
 
 class WarpSource(NamedTuple):
-    """The other view; see `tracking3d.points.view.SurfaceView`."""
+    """The other view; see `tracking3d.scene.surface.Drawn`."""
 
     intrinsics: NDArray[np.float64]
     image: NDArray[np.float32]

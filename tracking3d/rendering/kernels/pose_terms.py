@@ -13,6 +13,7 @@ from numba import boolean, float32, float64, int64, void
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.contour import MOST_ON_AN_EDGE, PROBE
 from tracking3d.rendering.kernels.compilation import (
     OPTIONS,
@@ -30,7 +31,6 @@ from tracking3d.rendering.kernels.visibility import draw_view
 from tracking3d.rendering.normal_equations import NormalEquations
 from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
 from tracking3d.rendering.surface import Surface
-from tracking3d.rendering.visibility import NEAR
 
 # mypy: disable-error-code="no-untyped-def"
 

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering import Rendering, SoftBand
 from tracking3d.rendering.renderer import to_camera, to_screen
-from tracking3d.rendering.visibility import NEAR
 
 CHUNK = 200_000
 """Pairs that are computed at once; larger chunks are slower, they leave the processor's cache."""

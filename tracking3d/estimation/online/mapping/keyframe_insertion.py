@@ -20,7 +20,9 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, rotation_angle
 from tracking3d.points.landmark_adjustment import LandmarkScene
-from tracking3d.points.view import LANDMARK_WINDOW, GreyWindow, SurfaceView, cut_window, draw_into_window
+from tracking3d.points.view import LANDMARK_WINDOW, cut_window, draw_into_window
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import FrameCrop
 
 _FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
 _MIN_INTERVAL = 3  # frames between two such keyframes
@@ -166,7 +168,7 @@ def cut_around_object(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None,
     pose: Pose,
-) -> GreyWindow | None:
+) -> FrameCrop | None:
     """The window of a frame in which landmarks are followed; None if there is nothing to be followed.
 
     Args:
@@ -182,7 +184,7 @@ def cut_around_object(
     return cut_window(image, mask, camera, pose.matrix().numpy(), vertices, LANDMARK_WINDOW)
 
 
-def draw_keyframe(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> SurfaceView | None:
+def draw_keyframe(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> Drawn | None:
     """A keyframe, or a frame that may become one, with the map's surface drawn at a pose; None if it has no window."""
     if view.image is None:
         return None

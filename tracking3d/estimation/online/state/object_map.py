@@ -19,8 +19,8 @@ from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.points.landmark_adjustment import LandmarkScene
-from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
+from tracking3d.scene.view import FrameCrop
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Keyframe:
     mask_weight: float = 1.0  # how far the mask is trusted, in [0, 1]
     strength: float = math.inf  # texture strength inside the mask, if it was computed; see `texture_strength`
     # the image around the object, for dense landmarks; None if there is no mask
-    image: GreyWindow | None = None
+    image: FrameCrop | None = None
     # whether dense landmarks have adjusted the pose, so that local mapping keeps it
     is_adjusted: bool = False
 

@@ -18,9 +18,9 @@ from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
-from tracking3d.points.view import GreyWindow
 from tracking3d.rendering import Surface
 from tracking3d.runtime.background_attempt import BackgroundAttempt
+from tracking3d.scene.view import FrameCrop
 from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
 
@@ -154,6 +154,6 @@ ONLINE_CLASSES = (
     FollowedPoints,
     Keypoints,
     LossBaseline,
-    GreyWindow,
+    FrameCrop,
 )
 """The classes that a `SolverState` consists of, besides `tracking3d.estimation.solver.STATE_CLASSES`."""
