@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.reconstruction import TextureView, texture_view
+from tracking3d.reconstruction import texture_view
 from tracking3d.rendering import render
+from tracking3d.scene.view import ObjectView
 
 SIDE = 160
 CAMERA = Camera.from_fov(SIDE, SIDE, 30.0)
@@ -70,7 +71,7 @@ def seen(
 
 def view(
     index: int, yaw: float, texture: NDArray[np.float32] | None = None, pitch: float = 0.0
-) -> TextureView:
+) -> ObjectView:
     """A view of the ball."""
     T_cam_obj = pose(yaw, pitch)
     image, mask = seen(T_cam_obj, pattern() if texture is None else texture)

@@ -12,7 +12,7 @@ from test_volume import CAMERA, shape_views
 from tracking3d.reconstruction import bake_texture
 from tracking3d.reconstruction import held_out_test as module
 from tracking3d.reconstruction.held_out_test import held_out_scores
-from tracking3d.reconstruction.shape_views import shape_view
+from tracking3d.reconstruction.views import shape_view
 
 pytest.importorskip("skimage", reason="the extra model is not installed")
 
@@ -40,7 +40,7 @@ def test_what_is_beside_the_mask_is_not_judged(out):
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
     model = bake_texture(ball(), views)
     other = texture.image.copy()
-    other[texture.valid <= 0] = 255
+    other[texture.interior <= 0] = 255
     elsewhere = held_out_scores(model, shape_views(YAWS), [(shape, replace(texture, image=other))])
     assert elsewhere.psnr == pytest.approx(held_out_scores(model, shape_views(YAWS), [out]).psnr, abs=1e-6)
     assert np.isfinite(elsewhere.ssim)
@@ -52,7 +52,7 @@ def test_the_signal_to_noise_ratio_is_that_of_the_pixels_within_the_mask(out, mo
     away = ball()
     away = replace(away, vertices=away.vertices + 100)
     monkeypatch.setattr(module, "refine_views", lambda surface, views: views)
-    picture, inside = texture.image / 255.0, texture.valid > 0
+    picture, inside = texture.image / 255.0, texture.interior > 0
     scores = held_out_scores(away, shape_views(YAWS), [out])
     assert scores.covered == 0
     assert scores.psnr == pytest.approx(-10 * np.log10(np.square(picture - 0.5)[inside].mean()), abs=1e-9)

@@ -15,7 +15,8 @@ from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
 from tracking3d.reconstruction.plane_sweep import Guide
 from tracking3d.reconstruction.shape import mesh_distance
-from tracking3d.reconstruction.shape_views import ShapeView, shape_view
+from tracking3d.reconstruction.views import shape_view
+from tracking3d.scene.view import ObjectView
 
 SIZE = np.array([1.6, 1.2, 1.0])
 CORNER = np.array([1.0, 1.0, -1.0])  # of the box, towards a camera that looks along z
@@ -92,23 +93,17 @@ def test_reflecting_twice_changes_nothing():
     np.testing.assert_allclose(plane.reflect(on_plane[None]), on_plane[None], atol=1e-12)
 
 
-def views_of_the_corner() -> list[ShapeView]:
+def views_of_the_corner() -> list[ObjectView]:
     """The box from one corner, in several poses; 200 pixels of it are enough for masks."""
     mesh = trimesh.creation.box(SIZE).subdivide().subdivide()
     guide = Guide(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
     views = []
     for index, (yaw, pitch) in enumerate(((-45, 30), (-38, 25), (-52, 25), (-45, 38), (-35, 35), (-55, 35))):
         T_cam_obj = pose(yaw, pitch)
-        everywhere = ShapeView(
-            index,
-            np.zeros((160, 160, 3), np.uint8),
-            np.ones((160, 160), np.float32),
-            np.array([-0.5, 159.5, -0.5, 159.5], np.float32),
-            CAMERA.K,
-            T_cam_obj,
-        )
+        image, frame = np.zeros((160, 160, 3), np.uint8), np.ones((160, 160), bool)
+        everywhere = ObjectView.of_frame(index, image, frame, CAMERA, T_cam_obj)
         mask = np.isfinite(guide.visible_to(everywhere)[0])
-        seen = shape_view(index, everywhere.image, mask, CAMERA, T_cam_obj)
+        seen = shape_view(index, image, mask, CAMERA, T_cam_obj)
         assert seen is not None
         views.append(seen)
     return views

@@ -32,9 +32,9 @@ def agreement(scene: LandmarkScene) -> float:
     """Mean IoU of silhouettes and true masks."""
     shares = []
     for view, (_, mask) in zip(scene.views, FRAMES, strict=True):
-        left, top = view.corner
+        left, top = view.window.left, view.window.top
         height, width = view.image.shape
-        drawn, true = view.beyond == 0, mask[top : top + height, left : left + width]
+        drawn, true = view.silhouette, mask[top : top + height, left : left + width]
         shares.append((drawn & true).sum() / (drawn | true).sum())
     return float(np.mean(shares))
 
@@ -60,10 +60,10 @@ def test_what_hides_the_object_in_some_frames_does_not_dent_it():
 def test_an_outline_is_half_way_between_pixels_inside_and_outside():
     view = opened(ball().vertices).views[0]
     outline = outline_of(view)
-    assert np.array_equal(outline.depth_inside > 0, view.mask > 0.5)
-    assert np.abs(outline.depth_inside).min() == 0.5
+    assert np.array_equal(outline.signed_distance > 0, view.mask > 0.5)
+    assert np.abs(outline.signed_distance).min() == 0.5
     assert outline.K[0, 0] == view.intrinsics[0] and outline.K[0, 2] == view.intrinsics[2]
-    assert outline.within.tolist() == [-0.5, view.mask.shape[1] - 0.5, -0.5, view.mask.shape[0] - 0.5]
+    assert outline.frame_edges.tolist() == [-0.5, view.mask.shape[1] - 0.5, -0.5, view.mask.shape[0] - 0.5]
     assert np.array_equal(outline.T_cam_obj, TRUE[0])
 
 

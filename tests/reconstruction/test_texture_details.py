@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.reconstruction import texturing
-from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap
+from tracking3d.scene.view import ObjectView
 
 YAWS = (-30, -15, 0, 15, 30)
 MODEL = ball()
@@ -26,7 +26,7 @@ def restore_details(model, texture, *rest) -> NDArray[np.float32]:
     return texturing.restore_details(model, planes, *rest).transpose(1, 2, 0)
 
 
-def views(texture: NDArray[np.float32] | None = None) -> list[TextureView]:
+def views(texture: NDArray[np.float32] | None = None) -> list[ObjectView]:
     return [view(index, yaw, texture) for index, yaw in enumerate(YAWS)]
 
 

@@ -19,12 +19,12 @@ def test_a_view_is_the_frame_around_the_object_at_its_own_resolution():
     found = texture_view(7, image, mask, CAMERA, T_cam_obj)
     assert found is not None and found.index == 7
     rows, columns = np.nonzero(mask)
-    assert found.extent == max(np.ptp(rows), np.ptp(columns)) + 1
-    assert found.extent <= len(found.image) <= 1.2 * found.extent
+    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    assert extent <= len(found.image) <= 1.2 * extent
     # A point of the object is where the window's intrinsics say, and shows the object's colour.
     x, y, z = T_cam_obj[:3, 3]
     column, row = (found.K @ (x / z, y / z, 1))[:2].round().astype(int)
-    assert found.valid[row, column] == 1
+    assert found.interior[row, column] == 1
     assert found.image[row, column] == pytest.approx(np.full(3, 128), abs=1)
 
 
@@ -32,7 +32,7 @@ def test_the_outline_belongs_to_nobody():
     found = view(0, 0.0)
     green = (found.image[..., 1] > 250) & (found.image[..., 0] < 5)
     assert green.any()
-    assert not found.valid[cv2.dilate(green.astype(np.uint8), np.ones((3, 3))) > 0].any()
+    assert not found.interior[cv2.dilate(green.astype(np.uint8), np.ones((3, 3))) > 0].any()
 
 
 @pytest.mark.parametrize("mask", ["empty", "a speck"])
@@ -47,8 +47,8 @@ def test_a_large_object_is_seen_smaller():
     image, mask = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000), bool)
     mask[100:1900, 100:1900] = True
     found = texture_view(0, image, mask, CAMERA, pose(0))
-    assert found is not None and found.extent == 1800
-    assert len(found.image) == len(found.valid) == 640
+    assert found is not None
+    assert len(found.image) == len(found.interior) == 640
 
 
 def test_those_that_are_kept_are_spread_over_all_that_was_seen():

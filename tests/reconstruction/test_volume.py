@@ -19,12 +19,13 @@ from tracking3d.reconstruction.shape import (
     mesh_distance,
     restore_uncovered,
 )
-from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
+from tracking3d.reconstruction.views import shape_view, spread_by_rotation
+from tracking3d.scene.view import ObjectView
 
 SIDE = 96
 
 
-def shape_views(yaws, pitch: float = 0.0) -> list[ShapeView]:
+def shape_views(yaws, pitch: float = 0.0) -> list[ObjectView]:
     """The ball with its pattern, turned by these degrees."""
     views = []
     for index, yaw in enumerate(yaws):
@@ -34,7 +35,7 @@ def shape_views(yaws, pitch: float = 0.0) -> list[ShapeView]:
 
 
 @pytest.fixture(scope="module")
-def around() -> list[ShapeView]:
+def around() -> list[ObjectView]:
     return shape_views(range(0, 360, 30)) + shape_views((0, 90, 180, 270), 60)
 
 
@@ -49,7 +50,7 @@ def test_the_hull_of_a_ball_is_the_ball(around):
 
 
 def test_wrong_masks_carve_nothing_as_long_as_they_are_few(around):
-    nothing = replace(around[3], depth_inside=np.full_like(around[3].depth_inside, -5.0))
+    nothing = replace(around[3], mask=np.zeros_like(around[3].mask))
     middle = np.zeros((1, 3), np.float32)
     views = [*around[:3], nothing, *around[4:]]
     assert carve_hull(middle, views, 0.4, 0.0, 1)[0] > 0
@@ -57,7 +58,8 @@ def test_wrong_masks_carve_nothing_as_long_as_they_are_few(around):
 
 
 def test_nothing_is_known_beyond_the_frame(around):
-    half = replace(around[0], within=np.array([SIDE / 2, SIDE, 0, SIDE], np.float32))
+    window = around[0].window  # the frame begins in its middle
+    half = replace(around[0], window=replace(window, left=-window.side // 2))
     left = np.array([[-0.5, 0, 0]], np.float32)
     assert carve_hull(left, [half], 0.4)[1] == 0
     assert carve_hull(left, [around[0]], 0.4)[1] == 1
@@ -116,8 +118,8 @@ def test_what_lies_beyond_a_window_has_no_vote(around):
     everywhere = np.full(len(grid.points), 0.1, np.float32)
     # The object fills the windows, whose edges many voxels lie beyond.
     nearer = np.diag([3, 3, 1])
-    full = np.full_like(around[0].depth_inside, 5)
-    close = [replace(view, K=nearer @ view.K, depth_inside=full) for view in around]
+    full = np.ones_like(around[0].mask)
+    close = [replace(view, K=nearer @ view.K, mask=full) for view in around]
     seen_by = np.zeros(len(grid.points), int)
     for view in close:
         x, y, z = view.P[:, :3] @ grid.points.T + view.P[:, 3:]

@@ -8,17 +8,17 @@ import numpy as np
 import torch
 
 from tracking3d.reconstruction.meshing import FloatArray
-from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.scene.view import ObjectView
 
 
 def robust_hull(
-    points: FloatArray, views: Sequence[ShapeView], far: float, share: float, least: int
+    points: FloatArray, views: Sequence[ObjectView], far: float, share: float, least: int
 ) -> tuple[FloatArray, FloatArray]:
     """See `tracking3d.reconstruction.shape.carve_hull`."""
     P = np.stack([view.P for view in views])
     focal = np.array([view.K[0, 0] for view in views])
-    inside = np.stack([view.depth_inside for view in views])
-    within = np.stack([view.within for view in views])
+    inside = np.stack([view.signed_distance for view in views])
+    within = np.stack([view.frame_edges for view in views])
     side = inside.shape[1]
     values = torch.full((len(P), len(points)), torch.inf, dtype=torch.float64)
     at = torch.from_numpy(np.asarray(points, np.float64))

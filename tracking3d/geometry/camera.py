@@ -169,18 +169,17 @@ class Window:
         return np.array([self.scale, self.shape[0] / self.sides[0]])
 
     def K(self, camera: Camera) -> NDArray[np.float64]:
-        """``(3, 3)`` intrinsics of ``camera`` in this window's pixels.
+        """``(3, 3)`` intrinsics of ``camera`` in this window's pixels."""
+        return self.through(camera.K)
+
+    def through(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Intrinsics ``(3, 3)`` of the frame in this window's pixels.
 
         Pixel centres are at integers in both grids, so ``u_window = (u + 0.5 - left) * scale - 0.5``.
         """
         sx, sy = self.scales
-        return np.array(
-            [
-                [sx * camera.fx, 0.0, (camera.cx + 0.5 - self.left) * sx - 0.5],
-                [0.0, sy * camera.fy, (camera.cy + 0.5 - self.top) * sy - 0.5],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        centre = (K[0, 2] + 0.5 - self.left) * sx - 0.5, (K[1, 2] + 0.5 - self.top) * sy - 0.5
+        return np.array([[sx * K[0, 0], 0.0, centre[0]], [0.0, sy * K[1, 1], centre[1]], [0.0, 0.0, 1.0]])
 
     @property
     def to_frame(self) -> NDArray[np.float64]:

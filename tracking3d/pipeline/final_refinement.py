@@ -22,7 +22,7 @@ from tracking3d.pipeline.refinement_steps import (
     RefinementSteps,
     Retracking,
 )
-from tracking3d.reconstruction import TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction import keep_best_views, texture_view
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, HeldAdjustment
 from tracking3d.rendering.backend import share_threads
 from tracking3d.results.files import decode_mask
@@ -31,6 +31,7 @@ from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.runtime.concurrency import BackgroundWriter
 from tracking3d.runtime.stage_times import measure
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation.frame_window import Mask
 
 
@@ -61,7 +62,7 @@ class FinalRefinement:
     ) -> None:
         self._session, self._writer, self._estimates = tracked.session, writer, estimates
         self._state, self._work = state, work
-        self._views: tuple[TextureView, ...] = ()
+        self._views: tuple[ObjectView, ...] = ()
         self._precomputed, self._earlier = precomputed, earlier
         wanted, camera = self._session.config.object, self._session.camera
         look: GlobalAdjustment | HeldAdjustment
@@ -215,7 +216,7 @@ class FinalRefinement:
             self._draw_decided(decided)
             self._estimates.together += watch.times
 
-    def final_model(self) -> tuple[ObjectModel, tuple[TextureView, ...]]:
+    def final_model(self) -> tuple[ObjectModel, tuple[ObjectView, ...]]:
         """The model with the adjusted surface, and the views of its texture with adjusted poses."""
         model, look = self._session.result(), self._last.look
         views = tuple(look.seen_by(view, self._estimates.estimate(view.index)) for view in self._views)

@@ -7,8 +7,7 @@ is zero, robustly; between the contours, and where no view has one, the displace
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
-from tracking3d.geometry.pixel_distance import pixel_distance
+from tracking3d.geometry.camera import Window
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import ObjectView
 
 STEPS = 3
 SCALE = 1.5
@@ -28,57 +28,15 @@ _SMOOTH, _SMALL = 3.0, 0.5
 _FARTHEST = 0.02  # of the object's diagonal, in a step
 
 
-class OutlineView(Protocol):
-    """What a view says of the outline."""
-
-    @property
-    def depth_inside(self) -> NDArray[np.float32]:
-        """``(h, w)`` pixels from the mask's outline, positive inside."""
-
-    @property
-    def within(self) -> NDArray[np.float32]:
-        """``(4,)`` left, right, top and bottom edge of the frame in the view's pixels."""
-
-    @property
-    def K(self) -> NDArray[np.float64]:
-        """``(3, 3)`` intrinsics of the view."""
-
-    @property
-    def T_cam_obj(self) -> NDArray[np.float64]:
-        """``(4, 4)``."""
-
-
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """The outline in a window; see `OutlineView`."""
-
-    depth_inside: NDArray[np.float32]
-    within: NDArray[np.float32]
-    K: NDArray[np.float64]
-    T_cam_obj: NDArray[np.float64]
-
-
-def outline_of(view: Drawn) -> Outline:
-    """What the mask of a view says of the outline.
-
-    A window ends that near to the object only where the frame does.
-    """
+def outline_of(view: Drawn) -> ObjectView:
+    """A view with the outline of its mask; a window ends that near to the object only where the frame does."""
     height, width = view.mask.shape
-    return Outline(
-        depth_inside(view.mask > 0.5),
-        np.array([-0.5, width - 0.5, -0.5, height - 0.5], np.float32),
-        view.K,
-        view.T_cam_obj,
-    )
-
-
-def depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Signed distance ``(h, w)`` to a mask's outline, which runs half-way between pixels inside and outside."""
-    return np.where(inside, pixel_distance(~inside) - 0.5, 0.5 - pixel_distance(inside)).astype(np.float32)
+    whole = Window(0, 0, width, width, (height, height))
+    return replace(view, window=whole, frame_size=(height, width), mask=view.mask > 0.5)
 
 
 def fit_to_outlines(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[OutlineView]
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ObjectView]
 ) -> NDArray[np.float64]:
     """``(V, 3)`` the vertices, moved.
 
@@ -115,19 +73,19 @@ def _equations(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],
-    view: OutlineView,
+    view: ObjectView,
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
     """How the distances of the contour's points change with displacements ``(N, V)``, and what they are ``(N,)``."""
     T = torch.from_numpy(view.T_cam_obj[None]).float()
     K = torch.from_numpy(view.K[None]).float()
     drawn = render(
         torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.zeros(len(faces), 3, 2),
-        torch.zeros(1, 2, 2), T[:, :3, :3], T[:, :3, 3], K, view.depth_inside.shape,
+        torch.zeros(1, 2, 2), T[:, :3, :3], T[:, :3, 3], K, view.window.shape,
     )  # fmt: skip
     contour = find_contour(drawn)
-    residual, slope = contour_slopes(contour, torch.from_numpy(-view.depth_inside[None]))
+    residual, slope = contour_slopes(contour, torch.from_numpy(-view.signed_distance[None]))
     x, y = contour.position.double().unbind(1)
-    left, right, top, bottom = (float(edge) for edge in view.within)
+    left, right, top, bottom = (float(edge) for edge in view.frame_edges)
     # Where the frame ends, so does the mask; the object does not.
     known = (x > left + 2) & (x < right - 2) & (y > top + 2) & (y < bottom - 2)
     points, share, ends = (

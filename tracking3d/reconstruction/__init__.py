@@ -2,6 +2,6 @@
 
 from tracking3d.reconstruction.texturing import bake_texture
 from tracking3d.reconstruction.unseen_closing import close_unseen
-from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction.views import keep_best_views, texture_view
 
-__all__ = ["TextureView", "bake_texture", "close_unseen", "keep_best_views", "texture_view"]
+__all__ = ["bake_texture", "close_unseen", "keep_best_views", "texture_view"]

@@ -30,9 +30,9 @@ from tracking3d.points.landmark_adjustment import (
     resect,
 )
 from tracking3d.points.view import LANDMARK_WINDOW, open_view
-from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
 from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import ObjectView
 
 ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
@@ -193,7 +193,7 @@ class GlobalAdjustment:
         """The model with the surface that was found."""
         return replace(model, vertices=self.vertices)
 
-    def seen_by(self, view: TextureView, record: FrameRecord) -> TextureView:
+    def seen_by(self, view: ObjectView, record: FrameRecord) -> ObjectView:
         """What the texture is taken from, with the pose that its frame has in the end."""
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
@@ -317,7 +317,7 @@ class HeldAdjustment:
         """The model as it is: its surface was refined before."""
         return model
 
-    def seen_by(self, view: TextureView, record: FrameRecord) -> TextureView:
+    def seen_by(self, view: ObjectView, record: FrameRecord) -> ObjectView:
         """What the texture is taken from, with the pose that its frame has in the end."""
         return replace(view, T_cam_obj=record.T_cam_obj)
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.photometric_poses import coloured_surface, refine_views
-from tracking3d.reconstruction.shape_views import ShapeView
-from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import render
+from tracking3d.scene.view import ObjectView
 
 EVERY = 8
 """One in this many reliable frames is kept out of the reconstruction."""
@@ -48,8 +47,8 @@ class HeldOutScore:
 def score_held_out(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
-    views: Sequence[ShapeView],
-    left_out: Sequence[ShapeView],
+    views: Sequence[ObjectView],
+    left_out: Sequence[ObjectView],
 ) -> HeldOutScore:
     """How well a shape, coloured by ``views``, explains those left out, whose poses alone are fitted to it.
 
@@ -93,7 +92,7 @@ class HeldOutScores:
 
 
 def held_out_scores(
-    model: ObjectModel, used: Sequence[ShapeView], left_out: Sequence[tuple[ShapeView, TextureView]]
+    model: ObjectModel, used: Sequence[ObjectView], left_out: Sequence[tuple[ObjectView, ObjectView]]
 ) -> HeldOutScores:
     """Render the model as the frames that were left out should show it, and compare.
 
@@ -110,7 +109,7 @@ def held_out_scores(
 
 
 def _compare(
-    model: ObjectModel, view: TextureView, T_cam_obj: NDArray[np.float64]
+    model: ObjectModel, view: ObjectView, T_cam_obj: NDArray[np.float64]
 ) -> tuple[float, float, float]:
     from kornia.metrics import psnr
     from skimage.metrics import structural_similarity
@@ -126,7 +125,7 @@ def _compare(
         torch.from_numpy(view.K[None]).float(),
         (len(view.image), len(view.image)),
     )
-    picture, inside = view.image / 255.0, view.valid > 0
+    picture, inside = view.image / 255.0, view.interior > 0
     covered = drawn.face_index[0].numpy() >= 0
     predicted = np.where(covered[..., None], drawn.image()[0].permute(1, 2, 0).numpy(), _UNCOVERED)
     predicted = np.where(inside[..., None], predicted, picture)  # outside the mask nothing is predicted

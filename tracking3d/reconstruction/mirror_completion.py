@@ -15,7 +15,7 @@ from tracking3d.reconstruction.meshing import FloatArray, Grid, decimate_roughly
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
 from tracking3d.reconstruction.plane_sweep import Guide
 from tracking3d.reconstruction.seen_vertices import seen_vertices
-from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.scene.view import ObjectView
 
 _FACES, _SAMPLES = 4000, 4000
 _NEAR = 0.015  # uncertainty of the surface's depth, of the diagonal
@@ -24,7 +24,7 @@ _BAND = 2  # pixels around the silhouette that may belong to the object or to th
 
 
 def complete_by_symmetry(
-    grid: Grid, inside: FloatArray, hull: FloatArray, views: Sequence[ShapeView]
+    grid: Grid, inside: FloatArray, hull: FloatArray, views: Sequence[ObjectView]
 ) -> tuple[FloatArray, list[SymmetryPlane]]:
     """A shape, with its mirror images added where no view has looked.
 
@@ -55,14 +55,14 @@ def complete_by_symmetry(
 class _Known:
     """What the views have seen."""
 
-    views: Sequence[ShapeView]  # the frames
+    views: Sequence[ObjectView]  # the frames
     # (S, S) depth of the surface in each: infinite on the background, and minus infinite in a narrow band
     # around the silhouette, where pixels may belong to either
     depths: Sequence[NDArray[np.float32]]
     near: float  # uncertainty of these depths
 
     @classmethod
-    def of(cls, mesh: trimesh.Trimesh, views: Sequence[ShapeView]) -> _Known:
+    def of(cls, mesh: trimesh.Trimesh, views: Sequence[ObjectView]) -> _Known:
         guide = Guide(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64))
         diagonal = float(np.linalg.norm(np.ptp(guide.vertices, axis=0)))
         depths = [guide.visible_to(view)[0] for view in views]
@@ -94,7 +94,7 @@ class _Known:
 
 
 def _sample_seen_surface(
-    mesh: trimesh.Trimesh, views: Sequence[ShapeView]
+    mesh: trimesh.Trimesh, views: Sequence[ObjectView]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Points ``(N, 3)`` spread over what was seen of a surface, their normals, and what share of it that is."""
     seen = seen_vertices(np.asarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int64), views)

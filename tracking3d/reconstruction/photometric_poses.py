@@ -16,7 +16,6 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from tracking3d.reconstruction.meshing import cell_atlas
-from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering import (
     BackProjection,
     PoseTarget,
@@ -27,6 +26,7 @@ from tracking3d.rendering import (
     pose_terms,
 )
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.view import ObjectView
 
 COLOUR, OUTLINE = 0.1, 2.0
 """Difference of colours in [0, 1], and pixels, from which on a disagreement counts less."""
@@ -37,7 +37,7 @@ _FARTHEST = 5.0  # degrees a pose may turn; a view that turns farther is rejecte
 
 
 def coloured_surface(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ShapeView]
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ObjectView]
 ) -> Surface:
     """The surface with the mean of what the views show of it.
 
@@ -54,7 +54,7 @@ def coloured_surface(
     for view in views:
         R, t, K = _place_surface(view)
         # A pixel or two within the outline colours are mixed with the background's.
-        valid = torch.from_numpy(np.clip((view.depth_inside - 1) / 2, 0, 1))
+        valid = torch.from_numpy(np.clip((view.signed_distance - 1) / 2, 0, 1))
         seen = seen + back_project(_picture(view), valid, points, corners, texels, R, t, K)
     # Between the cells texels continue the nearest one on a face: samples at a face's edge mix with them.
     uncovered = np.ones((size, size), np.bool_)
@@ -65,7 +65,7 @@ def coloured_surface(
     return Surface(points, corners, uvs, texture, known)
 
 
-def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView]:
+def refine_views(surface: Surface, views: Sequence[ObjectView]) -> list[ObjectView]:
     """The views with poses that fit the surface better.
 
     Args:
@@ -77,7 +77,7 @@ def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView
     ]
 
 
-def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:
+def _fit_pose(surface: Surface, view: ObjectView) -> NDArray[np.float64]:
     """``(4, 4)`` the pose that fits best, the present one if none fits better or it runs away."""
     mask = torch.from_numpy(view.mask)
     target = PoseTarget(
@@ -86,7 +86,7 @@ def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:
         mask.float(),
         torch.from_numpy(view.in_frame),
         mask,
-        torch.from_numpy(-view.depth_inside),
+        torch.from_numpy(-view.signed_distance),
     )
     first = view.T_cam_obj
     pose, (cost, matrix, gradient) = first, _cost(surface, target, first)
@@ -120,10 +120,10 @@ def _cost(
     return float(model.cost[0]), model.matrix[0].numpy(), model.gradient[0].numpy()
 
 
-def _place_surface(view: ShapeView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _place_surface(view: ObjectView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     T = torch.from_numpy(view.T_cam_obj).float()
     return T[:3, :3], T[:3, 3], torch.from_numpy(view.K).float()
 
 
-def _picture(view: ShapeView) -> torch.Tensor:
+def _picture(view: ObjectView) -> torch.Tensor:
     return torch.from_numpy(view.image).permute(2, 0, 1).float() / 255

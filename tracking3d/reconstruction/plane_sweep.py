@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from tracking3d.geometry.mesh import vertex_normals
 from tracking3d.reconstruction.meshing import FloatArray
-from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.view import ObjectView
 
 NEIGHBOURS, AGREEING = 6, 3
 """Views that a patch is looked for in, and those of them that count."""
@@ -43,7 +43,7 @@ _STEEPEST = 0.2  # cosine of the viewing angle below which a surface is too slan
 class DepthMap:
     """What one view says of depth."""
 
-    view: ShapeView  # the view
+    view: ObjectView  # the view
     depth: FloatArray  # (S, S) float32 z in camera coordinates, NaN where nothing is known
     score: FloatArray  # (S, S) float32 correlation there
     stride: int = 1  # spacing, in pixels, of the grid at which depths are estimated; at most
@@ -56,14 +56,14 @@ class Guide:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
 
-    def visible_to(self, view: ShapeView) -> tuple[FloatArray, FloatArray]:
+    def visible_to(self, view: ObjectView) -> tuple[FloatArray, FloatArray]:
         """Depth ``(S, S)``, infinite outside the surface, and unit normals ``(S, S, 3)`` in camera coordinates."""
         R = torch.from_numpy(view.T_cam_obj[None, :3, :3]).float()
         t = torch.from_numpy(view.T_cam_obj[None, :3, 3]).float()
         vertices, faces = torch.from_numpy(self.vertices).float(), torch.from_numpy(self.faces)
         screen, z = project(vertices, R, t, torch.from_numpy(view.K[None]).float())
-        size = view.depth_inside.shape
-        drawn = rasterize(screen, z, faces, (size[0], size[1]))
+        size = view.window.shape
+        drawn = rasterize(screen, z, faces, size)
         turned = (vertex_normals(vertices, faces) @ R[0].T)[faces]
         normals = np.zeros((*size, 3), np.float32)
         normals.reshape(-1, 3)[drawn.pixels.numpy()] = interpolate(
@@ -73,8 +73,8 @@ class Guide:
 
 
 def depth_maps(
-    views: Sequence[ShapeView],
-    references: Sequence[ShapeView],
+    views: Sequence[ObjectView],
+    references: Sequence[ObjectView],
     guide: Guide,
     reach: float,
     steps: int,
@@ -98,13 +98,13 @@ def depth_maps(
     return [_check_consistency(one, maps, reach / steps, stride) for one in maps]
 
 
-def _stride(references: Sequence[ShapeView]) -> int:
+def _stride(references: Sequence[ObjectView]) -> int:
     """Spacing of the pixels that are sampled: enough for the grid, and not all of a large view."""
     largest = max((int(view.mask.sum()) for view in references), default=0)
     return max(2, round(np.sqrt(largest / MOST_PIXELS)))
 
 
-def _neighbours(view: ShapeView, views: Sequence[ShapeView]) -> list[ShapeView]:
+def _neighbours(view: ObjectView, views: Sequence[ObjectView]) -> list[ObjectView]:
     least, most, best = BASELINE
     found = []
     for other in views:
@@ -118,13 +118,13 @@ def _neighbours(view: ShapeView, views: Sequence[ShapeView]) -> list[ShapeView]:
     return [one[2] for one in found[:NEIGHBOURS]]
 
 
-def _grey(view: ShapeView) -> FloatArray:
+def _grey(view: ObjectView) -> FloatArray:
     return cv2.GaussianBlur(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 0.7)
 
 
 def _depth_map(
-    view: ShapeView,
-    neighbours: Sequence[ShapeView],
+    view: ObjectView,
+    neighbours: Sequence[ObjectView],
     grey: dict[int, FloatArray],
     guide: Guide,
     reach: float,

@@ -20,10 +20,9 @@ from tracking3d.reconstruction.run_views import (
     views_of_frame,
 )
 from tracking3d.reconstruction.shape import MOST, reconstruct_shape
-from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.texturing import bake_texture, replace_shape
 from tracking3d.reconstruction.unseen_closing import close_unseen
-from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction.views import keep_best_views, spread_by_rotation, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
@@ -31,6 +30,7 @@ from tracking3d.results.redrawing import redraw_contact_sheet
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_progress
+from tracking3d.scene.view import ObjectView
 from tracking3d.video.source import FrameSource
 
 EXTENDS = "extends"
@@ -69,7 +69,7 @@ def retexture_run(
     """
     run = RunReader(folder)
     model = online_model(run)
-    views: tuple[TextureView, ...] = ()
+    views: tuple[ObjectView, ...] = ()
     for frame, record in reliable_frames(run, source):
         mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
         view = texture_view(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
@@ -111,7 +111,7 @@ def reshape_run(
     views: RunViews,
     largest: int,
     others: Sequence[ObjectModel] = (),
-    own_textures: tuple[TextureView, ...] | None = None,
+    own_textures: tuple[ObjectView, ...] | None = None,
 ) -> ShapedRun:
     """Reconstruct the shape of a run's object from views, and write the mesh if that explains them better.
 
@@ -183,9 +183,9 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
     check_packages()
     run = RunReader(folder)
     model = load_model(run.mesh_folder)
-    used: list[ShapeView] = []
-    left_out: list[tuple[ShapeView, TextureView]] = []
-    views: tuple[TextureView, ...] = ()
+    used: list[ObjectView] = []
+    left_out: list[tuple[ObjectView, ObjectView]] = []
+    views: tuple[ObjectView, ...] = ()
     count = 0
     for frame, record in reliable_frames(run, source):
         if (seen := views_of_frame(run, frame, record)) is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,13 +19,13 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
 from tracking3d.reconstruction.shape import MOST
-from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
-from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
+from tracking3d.reconstruction.views import keep_best_views, shape_view, spread_by_rotation, texture_view
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.view import ObjectView
 from tracking3d.trackers.crops import box_of
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource
@@ -94,7 +93,6 @@ def surface_keypoints(
     return SurfaceKeypoints(kept, points, P, np.asarray(T_cam_obj), length)
 
 
-_View = TypeVar("_View", ShapeView, TextureView)
 _NEXT_RUN = 10_000_000  # added to frame indices of another run, so that views of several have different ones
 
 
@@ -102,9 +100,9 @@ _NEXT_RUN = 10_000_000  # added to frame indices of another run, so that views o
 class RunViews:
     """The reliable frames of a run, or of several."""
 
-    shapes: Sequence[ShapeView]  # those that a shape is made from
-    left_out: Sequence[ShapeView]  # those that it is judged by
-    textures: tuple[TextureView, ...]  # those that a texture is taken from
+    shapes: Sequence[ObjectView]  # those that a shape is made from
+    left_out: Sequence[ObjectView]  # those that it is judged by
+    textures: tuple[ObjectView, ...]  # those that a texture is taken from
     keypoints: Sequence[SurfaceKeypoints] = ()  # those that the run is registered by, if that was asked
 
     def moved(self, similarity: Similarity, number: int) -> RunViews:
@@ -115,7 +113,7 @@ class RunViews:
             number: Which of several runs this is; it makes the frames' indices unique.
         """
 
-        def move(views: Iterable[_View]) -> list[_View]:
+        def move(views: Iterable[ObjectView]) -> list[ObjectView]:
             return [
                 replace(
                     view,
@@ -142,11 +140,11 @@ def collect_views(
     Raises:
         InputError: If the run goes on, or the video is another one.
     """
-    shapes: list[ShapeView] = []
-    left_out: list[ShapeView] = []
+    shapes: list[ObjectView] = []
+    left_out: list[ObjectView] = []
     keypoints: list[SurfaceKeypoints] = []
     count = 0
-    textures: tuple[TextureView, ...] = ()
+    textures: tuple[ObjectView, ...] = ()
     for frame, record in reliable_frames(run, source):
         seen = views_of_frame(run, frame, record)
         if seen is None:
@@ -166,7 +164,7 @@ def collect_views(
     return RunViews(shapes, spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT), textures, keypoints)
 
 
-def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ShapeView, TextureView] | None:
+def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ObjectView, ObjectView] | None:
     """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
     pose = run.camera_of(record), np.asarray(record.T_cam_obj)
     shape = shape_view(frame.index, frame.image, run.pinhole_mask(frame.index), *pose)

@@ -9,11 +9,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.reconstruction.plane_sweep import Guide
-from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.scene.view import ObjectView
 
 
 def seen_vertices(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ShapeView]
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ObjectView]
 ) -> NDArray[np.bool_]:
     """``(V,)`` whether any of the views shows a vertex.
 

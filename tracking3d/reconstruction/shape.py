@@ -34,9 +34,10 @@ from tracking3d.reconstruction.meshing import (
 from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps
-from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
+from tracking3d.reconstruction.views import spread_by_rotation
 from tracking3d.runtime.concurrency import start_in_thread
 from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.scene.view import ObjectView
 
 FEWEST = 8
 """Frames that a shape is made from."""
@@ -74,8 +75,8 @@ class ReconstructedShape:
 
 def reconstruct_shape(
     starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
-    views: Sequence[ShapeView],
-    left_out: Sequence[ShapeView],
+    views: Sequence[ObjectView],
+    left_out: Sequence[ObjectView],
 ) -> ReconstructedShape:
     """Make a shape that explains frames better than the one at hand.
 
@@ -122,7 +123,7 @@ def reconstruct_shape(
 
 
 def _volume(
-    starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], views: Sequence[ShapeView]
+    starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], views: Sequence[ObjectView]
 ) -> tuple[Grid, FloatArray, list[SymmetryPlane]]:
     """All evidence in a volume, positive inside, and the planes by which it was completed."""
     vertices = np.concatenate([points for points, _ in starts])
@@ -293,7 +294,7 @@ _COVERAGE_FACES = 6000
 
 
 def restore_uncovered(
-    grid: Grid, hull: FloatArray, shape: FloatArray, views: Sequence[ShapeView]
+    grid: Grid, hull: FloatArray, shape: FloatArray, views: Sequence[ObjectView]
 ) -> FloatArray:
     """A shape's signed distance, with that of the hull where views show the object and the shape is too small.
 
@@ -329,7 +330,7 @@ def restore_uncovered(
     return restored
 
 
-def _uncovered_pixels(guide: Guide, view: ShapeView) -> NDArray[np.bool_]:
+def _uncovered_pixels(guide: Guide, view: ObjectView) -> NDArray[np.bool_]:
     """``(S, S)`` the pixels of a view's mask that a surface leaves uncovered, more than a few pixels off."""
     depth, _ = guide.visible_to(view)
     around = np.ones((2 * _TOLERANCE + 1,) * 2, np.uint8)
@@ -459,7 +460,7 @@ LEAST = 1
 
 def carve_hull(
     points: FloatArray,
-    views: Sequence[ShapeView],
+    views: Sequence[ObjectView],
     far: float,
     share: float = SHARE,
     least: int = LEAST,
@@ -478,8 +479,8 @@ def carve_hull(
     """
     P = np.stack([view.P for view in views])
     focal = np.array([view.K[0, 0] for view in views])
-    inside = np.stack([view.depth_inside for view in views])
-    within = np.stack([view.within for view in views])
+    inside = np.stack([view.signed_distance for view in views])
+    within = np.stack([view.frame_edges for view in views])
     from tracking3d.reconstruction.kernels.visual_hull import robust_hull as compiled
 
     hull, seen = np.empty(len(points), np.float32), np.empty(len(points), np.float32)

@@ -24,13 +24,12 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.meshing import unwrap
 from tracking3d.reconstruction.seen_regions import select_seen_texels, spread_colours
 from tracking3d.reconstruction.seen_vertices import seen_vertices
-from tracking3d.reconstruction.shape_views import ShapeView
-from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, render, seen_texels
 from tracking3d.rendering.backend import give_threads, threads_kept
 from tracking3d.rendering.backprojection import SeenTexels
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.scene.view import ObjectView
 
 _SMALLEST = 64
 _STEEPNESS = 3
@@ -46,7 +45,7 @@ Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
 
 
 def bake_texture(
-    model: ObjectModel, views: Sequence[TextureView], largest: int = 2048, details: bool = True
+    model: ObjectModel, views: Sequence[ObjectView], largest: int = 2048, details: bool = True
 ) -> ObjectModel:
     """The model with a texture at the views' resolution; the same if no view shows it.
 
@@ -68,7 +67,7 @@ def bake_texture(
         return _paint_texture(model, views, texture_size(views, largest), details)
 
 
-def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int, details: bool) -> ObjectModel:
+def _paint_texture(model: ObjectModel, views: Sequence[ObjectView], size: int, details: bool) -> ObjectModel:
     report_progress("texture", 0, len(views))
     gains, coarse = _level_exposure(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
@@ -128,9 +127,10 @@ def add_view(
     texturing.add_view(total, weight, seen, gain, expected, sharpness, _VOTED_DOWN, _STEEPNESS)
 
 
-def texture_size(views: Sequence[TextureView], largest: int) -> int:
+def texture_size(views: Sequence[ObjectView], largest: int) -> int:
     """Texels along a side, a power of two: about one a pixel of the views, where the atlas goes once around."""
-    wanted = math.pi * max(min(view.extent, len(view.image)) for view in views)
+    boxes = (cv2.boundingRect(view.mask.astype(np.uint8)) for view in views)
+    wanted = math.pi * max(max(width, height) for _, _, width, height in boxes)
     return min(max(1 << round(math.log2(wanted)), _SMALLEST), largest)
 
 
@@ -177,7 +177,7 @@ def continue_charts(values: FloatArray, texel: NDArray[np.int64]) -> FloatArray:
 
 
 def _level_exposure(
-    model: ObjectModel, views: Sequence[TextureView], size: int
+    model: ObjectModel, views: Sequence[ObjectView], size: int
 ) -> tuple[list[FloatArray], FloatArray]:
     """Factors ``(3,)`` that bring each view's colours to one level, and the texture ``(T, T, 3)`` that they give."""
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
@@ -208,10 +208,10 @@ def _divide_safely(total: FloatArray, weight: FloatArray) -> FloatArray:
     return np.asarray(total / np.maximum(weight, 1e-20)[:, None], np.float32)
 
 
-def _seen(model: ObjectModel, texels: TexelMap, view: TextureView) -> Seen:
+def _seen(model: ObjectModel, texels: TexelMap, view: ObjectView) -> Seen:
     seen = seen_texels(
         torch.from_numpy(view.image).permute(2, 0, 1).float() / 255,
-        torch.from_numpy(view.valid),
+        torch.from_numpy(view.interior),
         torch.from_numpy(model.vertices).float(),
         torch.from_numpy(model.faces),
         texels,
@@ -229,7 +229,7 @@ def replace_shape(
     model: ObjectModel,
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
-    views: Sequence[ShapeView],
+    views: Sequence[ObjectView],
 ) -> ObjectModel:
     """The object with another surface at the same place.
 
@@ -300,7 +300,7 @@ def restore_details(
     model: ObjectModel,
     texture: FloatArray,
     texels: TexelMap,
-    views: Sequence[TextureView],
+    views: Sequence[ObjectView],
     gains: Sequence[FloatArray],
 ) -> FloatArray:
     """A texture with the details that its views show and it does not.
@@ -336,24 +336,22 @@ def _find_missing_details(
     face_uvs: Tensor,
     colours: Tensor,
     texels: TexelMap,
-    view: TextureView,
+    view: ObjectView,
     gain: FloatArray,
-) -> tuple[TextureView, SeenTexels]:
+) -> tuple[ObjectView, SeenTexels]:
     """The difference between what a view shows of its texels and what the texture predicts."""
     R = torch.from_numpy(view.T_cam_obj[:3, :3]).float()
     t, K = torch.from_numpy(view.T_cam_obj[:3, 3]).float(), torch.from_numpy(view.K).float()
-    size = view.valid.shape[0], view.valid.shape[1]
+    size = view.window.shape
     drawn = render(*surface, face_uvs, colours, R[None], t[None], K[None], size)
     predicted = drawn.image()[0].permute(1, 2, 0).numpy()
-    valid = view.valid * (drawn.face_index[0].numpy() >= 0)
+    valid = view.interior * (drawn.face_index[0].numpy() >= 0)
     difference, valid = _remove_light(view.image * (gain / 255) - predicted, valid)
     layers = torch.from_numpy(difference).permute(2, 0, 1)
     return view, seen_texels(layers, torch.from_numpy(valid), *surface, texels, R, t, K)
 
 
-def _add(
-    total: FloatArray, weight: FloatArray, done: tuple[TextureView, SeenTexels], sharpest: float
-) -> None:
+def _add(total: FloatArray, weight: FloatArray, done: tuple[ObjectView, SeenTexels], sharpest: float) -> None:
     """Add what a view shows to the weighted sums ``(3, N)`` and the sum of weights ``(N,)``."""
     view, seen = done
     texel, share = seen.texel.numpy(), seen.weight.numpy() * np.float32(view.sharpness / sharpest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import NEAR, Window
+from tracking3d.geometry.camera import NEAR, Camera, Window
+from tracking3d.geometry.pixel_distance import pixel_distance
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Plane = NDArray[np.float32]
+
+_MIXED = (1.5, 4.5)
+"""Pixels within the outline up to which, and from which on, colours are the background's and the object's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +31,7 @@ class FrameCrop:
     frame_size: tuple[int, int]  # (H, W) of the frame
     # (h, w) the object: bool; where points are followed how far, uint8 to 255 or float32 to 1. None if it is not known
     mask: NDArray[Any] | None = None
+    index: int = -1  # of the frame, where it matters
 
     @classmethod
     def of(cls, frame: Image, window: Window) -> Self:
@@ -64,6 +69,67 @@ class ObjectView(FrameCrop):
     mask: NDArray[Any]
     K: Array  # (3, 3) intrinsics of the window
     T_cam_obj: Array  # (4, 4); NaN if there is no pose
+
+    @classmethod
+    def of_frame(cls, index: int, image: Image, mask: Mask, camera: Camera, T_cam_obj: Array) -> Self:
+        """A whole frame, which `at` cuts out.
+
+        Args:
+            index: Index of the frame.
+            image: ``(H, W, 3)`` RGB.
+            mask: ``(H, W)`` the object.
+            camera: Camera of the frame.
+            T_cam_obj: ``(4, 4)``.
+        """
+        height, width = mask.shape
+        window, pose = Window(0, 0, width, width, (height, height)), np.array(T_cam_obj, np.float64)
+        return cls(window, image, (height, width), index=index, mask=mask, K=camera.K, T_cam_obj=pose)
+
+    def at(self, window: Window) -> Self:
+        """What ``window`` sees of this view, which is of a whole frame."""
+        seen = (crop_window(self.mask, window) > 0.5) & inside_frame(self.frame_size, window)
+        return replace(
+            self, window=window, image=crop_window(self.image, window), K=window.through(self.K), mask=seen
+        )
+
+    @cached_property
+    def signed_distance(self) -> Plane:
+        """``(h, w)`` pixels from the mask's outline, half-way between pixels inside and outside; positive inside."""
+        inside: Plane = pixel_distance(~self.mask) - 0.5
+        return np.where(self.mask, inside, 0.5 - pixel_distance(self.mask)).astype(np.float32)
+
+    @cached_property
+    def interior(self) -> Plane:
+        """``(h, w)`` in [0, 1], how far each pixel is surely the object's; at the outline colours are mixed."""
+        depth = cv2.distanceTransform(self.mask.astype(np.uint8), cv2.DIST_L2, 5)
+        return np.clip((depth - _MIXED[0]) / (_MIXED[1] - _MIXED[0]), 0.0, 1.0).astype(np.float32)
+
+    @cached_property
+    def sharpness(self) -> float:
+        """Share of the contrast within the object that is in the finest details; larger is sharper."""
+        grey, within = self.grey.astype(np.float32), self.interior > 0.5
+        if not within.any():
+            return 0.0
+        fine = cv2.Laplacian(grey, cv2.CV_32F)[within]
+        return float(np.mean(np.square(fine)) / (np.var(grey[within]) + 1.0))
+
+    @property
+    def frame_edges(self) -> Plane:
+        """``(4,)`` left, right, top and bottom edge of the frame in the window's pixels."""
+        (height, width), (across, down) = self.frame_size, self.window.scales
+        columns, rows = np.array([0, width]) - self.window.left, np.array([0, height]) - self.window.top
+        return (np.concatenate([columns * across, rows * down]) - 0.5).astype(np.float32)
+
+    @property
+    def P(self) -> Array:
+        """``(3, 4)`` from object coordinates to pixels of the window, times the depth."""
+        return np.asarray(self.K @ self.T_cam_obj[:3])
+
+    @property
+    def direction(self) -> Array:
+        """``(3,)`` unit vector from the object's origin to the camera, in object coordinates."""
+        towards = -self.T_cam_obj[:3, :3].T @ self.T_cam_obj[:3, 3]
+        return np.asarray(towards / max(float(np.linalg.norm(towards)), 1e-12))
 
     @property
     def intrinsics(self) -> Array:
