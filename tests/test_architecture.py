@@ -62,7 +62,7 @@ ROOM_LINES = {
     "report": 1800,
     "results": 5350,
     "runtime": 1100,
-    "scene": 300,
+    "scene": 350,
     "segmentation": 2150,
     "submaps": 2200,
     "synthesis": 600,

@@ -26,8 +26,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.scene.view import crop_window
-from tracking3d.segmentation.frame_window import Answered
+from tracking3d.scene.view import ObjectView, crop_window
 from tracking3d.segmentation.temporal_neighbours import REACH
 from tracking3d.segmentation.whole_video import PixelEvidence, VideoSegmenter
 
@@ -38,7 +37,7 @@ _LEAST_OVERLAP = 0.4  # below with both masks, a frame is of something else
 _WEIGHTS = Path(__file__).resolve().parents[1] / "tracking3d" / "segmentation" / "whole_video_weights.py"
 
 
-def answered_frames(run: RunReader, clip: Path) -> Iterator[Answered]:
+def answered_frames(run: RunReader, clip: Path) -> Iterator[ObjectView]:
     """The frames of a finished run, with images from the ``frames`` of its sequence."""
     for record in run.frames:
         (file,) = (clip / "frames").glob(f"{record.index:06d}.*")
@@ -46,7 +45,8 @@ def answered_frames(run: RunReader, clip: Path) -> Iterator[Answered]:
         answer, initial = run.mask(record.index), run.initial_mask(record.index)
         initial = np.zeros_like(answer) if initial is None else initial
         pose = np.full((4, 4), np.nan) if record.status is Status.LOST else record.T_cam_obj
-        yield Answered(record.index, image, initial, answer, pose, record.confidence)
+        known = {"initial": initial, "confidence": record.confidence}
+        yield ObjectView.of_frame(record.index, image, answer, run.camera, pose, **known)
 
 
 def seen_once(run: RunReader, clip: Path) -> VideoSegmenter:
@@ -62,17 +62,17 @@ def seen_once(run: RunReader, clip: Path) -> VideoSegmenter:
 
 def asked(
     run: RunReader, clip: Path, every: int
-) -> Iterator[tuple[Answered, NDArray[np.bool_], PixelEvidence]]:
+) -> Iterator[tuple[ObjectView, NDArray[np.bool_], PixelEvidence]]:
     """What is said of every so many frames, and where the object is in their windows ``(S, S)``."""
     hindsight = seen_once(run, clip)
     wanted = {one.index for one in run.frames[::every]}
-    waiting: deque[Answered] = deque()
+    waiting: deque[ObjectView] = deque()
 
-    def said(frame: Answered) -> Iterator[tuple[Answered, NDArray[np.bool_], PixelEvidence]]:
+    def said(frame: ObjectView) -> Iterator[tuple[ObjectView, NDArray[np.bool_], PixelEvidence]]:
         exact = read_mask(clip / "masks" / f"{frame.index:06d}.png") if frame.index in wanted else None
         if (
             exact is None
-            or max(_overlap(mask, exact) for mask in (frame.initial, frame.answer)) < _LEAST_OVERLAP
+            or max(_overlap(mask, exact) for mask in (frame.initial, frame.mask)) < _LEAST_OVERLAP
         ):
             return
         if (found := hindsight.said(frame)) is not None:

@@ -9,8 +9,8 @@ import twins.motion_cue as plain_motion
 import twins.soft_visual_hull as plain_hull
 
 from tracking3d.geometry.camera import Camera, Window
+from tracking3d.scene.surface import Drawn
 from tracking3d.segmentation import colour_models, motion_cue, soft_visual_hull
-from tracking3d.segmentation.frame_window import FrameWindow
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 rng = np.random.default_rng(0)
@@ -63,9 +63,10 @@ def test_both_motions_lead_to_the_same_places(monkeypatch):
     nothing = np.zeros((48, 48), bool)
     inverse_depth = np.where(np.mgrid[:48, :48][0] > 5, rng.uniform(0.1, 0.2, (48, 48)), 0).astype(np.float32)
     image = np.zeros((120, 160, 3), np.uint8)
-    scene = FrameWindow(
-        window, image[:48, :48], window.K(CAMERA), pose, nothing, nothing, nothing, inverse_depth, 1, ~nothing
-    )
+    scene = Drawn(
+        window, image[:48, :48], image.shape[:2], mask=nothing, K=window.K(CAMERA), T_cam_obj=pose,
+        inverse_depth=inverse_depth, beyond=inverse_depth,
+    )  # fmt: skip
     H = np.array([[1.02, 0.01, -6.0], [0.0, 0.98, 3.0], [1e-4, 0.0, 1.0]])
     target = image, moved, H
     fast = motion_cue._motion_parallax(scene, CAMERA, target)

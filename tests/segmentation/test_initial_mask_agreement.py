@@ -10,9 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
-from tracking3d.segmentation.frame_window import Answered, FrameWindow, surface_in
+from tracking3d.scene.surface import Drawn, draw_depth
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
-from tracking3d.segmentation.whole_video import VideoSegmenter, segment_all
+from tracking3d.segmentation.whole_video import VideoSegmenter, draw_around_masks, segment_all
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 BLOCK = trimesh.creation.box((2.4, 0.8, 1.2))
@@ -37,18 +38,18 @@ def with_a_strip(number: int, mask: np.ndarray) -> np.ndarray:
     return mask | np.roll(mask, (-1) ** number * (4 + number % 3), number % 2)
 
 
-def frames(spoil: Spoil = exact) -> list[Answered]:
+def frames(spoil: Spoil = exact) -> list[ObjectView]:
     found = []
     for number in range(FRAMES):
         T = pose(number)
-        mask, _ = surface_in(CAMERA.K, T, np.asarray(BLOCK.vertices), np.asarray(BLOCK.faces), 160)
-        initial = spoil(number, mask[:120])
+        block = np.asarray(BLOCK.vertices), np.asarray(BLOCK.faces)
+        initial = spoil(number, draw_depth(CAMERA.K, T, *block, (120, 160))[1] == 0)
         image = np.random.default_rng(number).integers(0, 256, (120, 160, 3)).astype(np.uint8)
-        found.append(Answered(number, image, initial, initial, T, 0.9))
+        found.append(ObjectView.of_frame(number, image, initial, CAMERA, T, initial=initial, confidence=0.9))
     return found
 
 
-def agreement(given: list[Answered]) -> InitialMaskAgreement:
+def agreement(given: list[ObjectView]) -> InitialMaskAgreement:
     found = InitialMaskAgreement(np.asarray(BALL.vertices, np.float64))
     for one in given:
         found.see(scene_of(one))
@@ -56,10 +57,8 @@ def agreement(given: list[Answered]) -> InitialMaskAgreement:
     return found
 
 
-def scene_of(one: Answered) -> FrameWindow:
-    scene = FrameWindow.of(
-        one, CAMERA, np.asarray(BALL.vertices, np.float64), np.asarray(BALL.faces, np.int64)
-    )
+def scene_of(one: ObjectView) -> Drawn:
+    scene = draw_around_masks(one, np.asarray(BALL.vertices, np.float64), np.asarray(BALL.faces, np.int64))
     assert scene is not None
     return scene
 
@@ -112,7 +111,7 @@ def segmenter_of(given):
     for one in given:
         known.see(one)
     known.settle()
-    spoiled = [replace(one, answer=with_a_strip(one.index, one.initial)) for one in given]
+    spoiled = [replace(one, mask=with_a_strip(one.index, one.initial)) for one in given]
     return known, spoiled
 
 

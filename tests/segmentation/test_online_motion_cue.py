@@ -9,7 +9,7 @@ import trimesh
 from twins import motion_cue
 
 from tracking3d.geometry.camera import Window
-from tracking3d.segmentation.frame_window import surface_in
+from tracking3d.scene.surface import draw_depth
 from tracking3d.segmentation.online_motion_cue import (
     MOVES,
     MotionReference,
@@ -47,9 +47,8 @@ def glimpse(clip, number: int, known: np.ndarray) -> MotionReference:
 def plates(clip) -> list[np.ndarray]:
     """``(H, W)`` silhouettes of the plate in every frame."""
     height, width = clip.masks.shape[1:]
-    side = max(height, width)
     return [
-        surface_in(clip.camera.K, T_cam_obj, *front(), side)[0][:height, :width]
+        draw_depth(clip.camera.K, T_cam_obj, *front(), (height, width))[1] == 0
         for T_cam_obj in clip.T_cam_obj
     ]
 

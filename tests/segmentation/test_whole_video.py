@@ -10,8 +10,9 @@ import pytest
 import trimesh
 
 from tracking3d.geometry.camera import Camera
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation import whole_video
-from tracking3d.segmentation.frame_window import Answered, FrameWindow
 from tracking3d.segmentation.motion_cue import background_motion, flow_distance, motion_cue, small_grey
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import TemporalNeighbours
@@ -20,6 +21,7 @@ from tracking3d.segmentation.whole_video import (
     PixelEvidence,
     VideoSegmenter,
     alignment,
+    draw_around_masks,
     edge_strength,
     segment_all,
 )
@@ -49,9 +51,13 @@ def frame(number: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return image, mask, T
 
 
-def answered(number: int, spoil=lambda mask: mask, **changes) -> Answered:
+def answered(number: int, spoil=lambda mask: mask, **changes) -> ObjectView:
     image, mask, T = frame(number)
-    return replace(Answered(number, image, spoil(mask), spoil(mask), T, 0.9), **changes)
+    return replace(seen(number, image, spoil(mask), T), **changes)
+
+
+def seen(number: int, image: np.ndarray, mask: np.ndarray, T: np.ndarray, **known) -> ObjectView:
+    return ObjectView.of_frame(number, image, mask, CAMERA, T, initial=mask, confidence=0.9, **known)
 
 
 def with_strip(mask: np.ndarray) -> np.ndarray:
@@ -59,7 +65,7 @@ def with_strip(mask: np.ndarray) -> np.ndarray:
     return mask | np.roll(mask, 7, 0)
 
 
-def looked_at(frames: list[Answered]) -> dict[int, np.ndarray | None]:
+def looked_at(frames: list[ObjectView]) -> dict[int, np.ndarray | None]:
     known = VideoSegmenter(CAMERA, VERTICES, FACES, {one.index: one.confidence for one in frames})
     for one in frames:
         known.see(one)
@@ -143,11 +149,11 @@ def bar_in_front(first: int) -> np.ndarray:
     return np.broadcast_to((columns >= first) & (columns < first + 8), (120, 160))
 
 
-def behind(bar: np.ndarray, number: int) -> Answered:
+def behind(bar: np.ndarray, number: int) -> ObjectView:
     """A frame with a bar in front, which the masks leave out."""
     image, mask, T = frame(number)
     image = np.where(bar[..., None], 128, image).astype(np.uint8)
-    return Answered(number, image, mask & ~bar, mask & ~bar, T, 0.9, bar)
+    return seen(number, image, mask & ~bar, T, occluder=bar)
 
 
 def test_a_mask_goes_on_behind_what_is_in_front_for_a_while():
@@ -182,7 +188,7 @@ def test_what_is_hidden_in_every_frame_is_not_made_up():
 )
 def test_what_cannot_be_told_is_left_as_it_is(frames):
     for index, mask in looked_at(frames).items():
-        assert mask is None or overlap(mask, frames[index].answer) > 0.9
+        assert mask is None or overlap(mask, frames[index].mask) > 0.9
 
 
 def test_a_mask_that_would_change_beyond_belief_stands():
@@ -191,19 +197,19 @@ def test_a_mask_that_would_change_beyond_belief_stands():
         [answered(number) for number in range(3, 12)] + [replace(e, index=20 + e.index) for e in elsewhere]
     )
     assert all(
-        found[20 + number] is None or overlap(found[20 + number], elsewhere[number].answer) > 0.6
+        found[20 + number] is None or overlap(found[20 + number], elsewhere[number].mask) > 0.6
         for number in range(3)
     )
 
 
-def scenes(count: int, spoil=lambda mask: mask) -> list[FrameWindow]:
-    found = [FrameWindow.of(answered(number, spoil), CAMERA, VERTICES, FACES) for number in range(count)]
+def scenes(count: int, spoil=lambda mask: mask) -> list[Drawn]:
+    found = [draw_around_masks(answered(number, spoil), VERTICES, FACES) for number in range(count)]
     return [scene for scene in found if scene is not None]
 
 
 def test_the_drawn_surface_is_the_ball():
     for scene in scenes(3):
-        assert overlap(scene.drawn, scene.answer) > 0.95
+        assert overlap(scene.silhouette, scene.mask) > 0.95
         assert scene.inverse_depth.max() == pytest.approx(1 / (DEPTH - 1), rel=0.02)
 
 
@@ -212,10 +218,10 @@ def test_a_hull_of_exact_masks_has_their_outline_and_one_wrong_mask_carves_nothi
     for wrong in (False, True):
         consensus = SoftVisualHull(VERTICES)
         for number, scene in enumerate(views):
-            consensus.see(replace(scene, answer=scene.answer & False) if wrong and number == 5 else scene)
+            consensus.see(replace(scene, mask=scene.mask & False) if wrong and number == 5 else scene)
         consensus.settle()
         wide = consensus.drawn(views[7])[1]
-        assert overlap(wide > 0, views[7].answer) > 0.9
+        assert overlap(wide > 0, views[7].mask) > 0.9
 
 
 def test_few_views_have_no_hull():
@@ -235,14 +241,14 @@ def test_the_ball_moves_with_itself_and_the_background_stands():
     np.testing.assert_allclose(targets[0][2], np.eye(3), atol=0.3)
     assert flow_distance(scene, CAMERA, targets[0]) >= 4
     cue = motion_cue(scene, CAMERA, targets)
-    inside, outside = cv2.erode(scene.answer.astype(np.uint8), np.ones((9, 9))) > 0, ~scene.answer
+    inside, outside = cv2.erode(scene.mask.astype(np.uint8), np.ones((9, 9))) > 0, ~scene.mask
     for one in cue:
         assert one[inside].mean() > 0.3 and one[outside].mean() < -0.1
 
 
 def test_what_is_even_or_stands_still_moves_with_anything():
     even = [replace(answered(n), image=np.full((120, 160, 3), 90, np.uint8)) for n in range(2)]
-    assert background_motion(*(small_grey(one.image) for one in even), even[0].answer) is None
+    assert background_motion(*(small_grey(one.image) for one in even), even[0].mask) is None
     scene, still = scenes(1)[0], answered(0)
     assert not motion_cue(scene, CAMERA, [(still.image, still.T_cam_obj, np.eye(3))]).any()
 
@@ -259,8 +265,8 @@ def test_an_outline_on_edges_is_told_from_one_beside_them():
 
 def test_every_source_is_odd_and_has_a_weight():
     scene = scenes(1)[0]
-    hulls = np.stack([np.where(scene.answer, 5, -5).astype(np.float32)] * 2)
-    said = PixelEvidence.of(scene, hulls, None, np.zeros((2, *scene.answer.shape), np.float32))
+    hulls = np.stack([np.where(scene.mask, 5, -5).astype(np.float32)] * 2)
+    said = PixelEvidence.of(scene, hulls, None, np.zeros((2, *scene.mask.shape), np.float32))
     planes = dict(said.sources())
     assert set(planes) == set(WEIGHTS)
     mirrored = replace(

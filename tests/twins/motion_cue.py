@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.segmentation.frame_window import Plane
+from tracking3d.scene.view import Plane
 from tracking3d.segmentation.motion_cue import Matrix, _carry_through, _project
 
 

@@ -31,8 +31,7 @@ from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.runtime.concurrency import BackgroundWriter
 from tracking3d.runtime.stage_times import measure
-from tracking3d.scene.view import ObjectView
-from tracking3d.segmentation.frame_window import Mask
+from tracking3d.scene.view import Mask, ObjectView
 
 
 class FinalRefinement:

@@ -42,9 +42,9 @@ from tracking3d.results.refinement_writer import adjusted_record
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import load_own_model, read_own_records
 from tracking3d.runtime.stage_times import StageTimes
-from tracking3d.segmentation.frame_window import Answered, FrameWindow
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation.temporal_neighbours import REACH
-from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter
+from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter, draw_around_masks
 
 Decision = tuple[Frame, SegmentedMask | None]
 """A frame that is due, and its mask; None if its present mask stays."""
@@ -225,13 +225,9 @@ class RefinementSteps:
         assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
         if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
             return True
-        window = FrameWindow.of(
-            self._segmentation_input(frame, T_cam_obj),
-            replace(self.look.camera, lens=None),
-            self.look.vertices_of_landmarks,
-            self.look.faces,
-        )
-        agreement = None if window is None else mask_iou_or_none(window.answer, window.drawn)
+        surface = self.look.vertices_of_landmarks, self.look.faces
+        drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
+        agreement = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (agreement or 0.0) <= self._retracking.least_agreement
 
     def begin_masks(self, config: PipelineConfig) -> None:
@@ -274,20 +270,21 @@ class RefinementSteps:
         assert self.masks is not None
         yield from map(self._make_decision, self.masks.rest())
 
-    def _segmentation_input(self, frame: Frame, T_cam_obj: NDArray[np.float64] | None = None) -> Answered:
+    def _segmentation_input(self, frame: Frame, T_cam_obj: NDArray[np.float64] | None = None) -> ObjectView:
         """A frame as `VideoSegmenter` takes it, through a camera without distortion; at another pose if given."""
         camera, record = self.look.camera, self._estimates.estimate(frame.index)
         mask, initial = self._estimates.mask(record), self._estimates.initial_mask(frame.index)
         occluder = self._estimates.occluder(frame.index)
         T_cam_obj = record.T_cam_obj if T_cam_obj is None else T_cam_obj
-        return Answered(
+        return ObjectView.of_frame(
             record.index,
             camera.undistort(frame.image),
-            camera.mask_to_pinhole(np.zeros_like(mask) if initial is None else initial),
             camera.mask_to_pinhole(mask),
+            camera,
             T_cam_obj if _has_pose(record) else np.full((4, 4), np.nan),
-            record.confidence,
-            None if occluder is None else camera.mask_to_pinhole(occluder),
+            initial=camera.mask_to_pinhole(np.zeros_like(mask) if initial is None else initial),
+            occluder=None if occluder is None else camera.mask_to_pinhole(occluder),
+            confidence=record.confidence,
         )
 
     def _visible(self, record: FrameRecord) -> NDArray[np.bool_]:

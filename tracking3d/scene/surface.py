@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -24,10 +25,10 @@ class Drawn(ObjectView):
     inverse_depth: Plane
     beyond: Plane  # (h, w) float32 pixels to the nearest drawn one; 0 on the surface
 
-    @property
+    @cached_property
     def silhouette(self) -> Mask:
-        """``(h, w)`` where the surface is, also beyond the frame."""
-        return self.beyond == 0
+        """``(h, w)`` where the surface is, as far as the frame goes."""
+        return (self.beyond == 0) & self.in_frame
 
     def surface(self, xy: Array) -> Array:
         """The object points ``(N, 3)`` under pixels ``(N, 2)``; NaN where it is not carried on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -68,10 +68,16 @@ class ObjectView(FrameCrop):
 
     mask: NDArray[Any]
     K: Array  # (3, 3) intrinsics of the window
-    T_cam_obj: Array  # (4, 4); NaN if there is no pose
+    T_cam_obj: Array  # (4, 4); NaN if there is no pose that is trusted
+    # (h, w) the mask tracker's mask; (0, 0) where it does not matter
+    initial: Mask = field(default_factory=lambda: np.zeros((0, 0), bool))
+    occluder: Mask | None = None  # (h, w) what is in front of the object; None if nothing is known
+    confidence: float = 1.0  # of the pose, in [0, 1]
 
     @classmethod
-    def of_frame(cls, index: int, image: Image, mask: Mask, camera: Camera, T_cam_obj: Array) -> Self:
+    def of_frame(
+        cls, index: int, image: Image, mask: Mask, camera: Camera, T_cam_obj: Array, **known: Any
+    ) -> Self:
         """A whole frame, which `at` cuts out.
 
         Args:
@@ -80,17 +86,25 @@ class ObjectView(FrameCrop):
             mask: ``(H, W)`` the object.
             camera: Camera of the frame.
             T_cam_obj: ``(4, 4)``.
+            known: Further fields, ``(H, W)`` if they are masks.
         """
         height, width = mask.shape
         window, pose = Window(0, 0, width, width, (height, height)), np.array(T_cam_obj, np.float64)
-        return cls(window, image, (height, width), index=index, mask=mask, K=camera.K, T_cam_obj=pose)
+        return cls(
+            window, image, (height, width), index=index, mask=mask, K=camera.K, T_cam_obj=pose, **known
+        )
 
     def at(self, window: Window) -> Self:
         """What ``window`` sees of this view, which is of a whole frame."""
-        seen = (crop_window(self.mask, window) > 0.5) & inside_frame(self.frame_size, window)
-        return replace(
-            self, window=window, image=crop_window(self.image, window), K=window.through(self.K), mask=seen
-        )
+        inside = inside_frame(self.frame_size, window)
+        masks = {"mask": self.mask, "initial": self.initial, "occluder": self.occluder}
+        seen: dict[str, Any] = {
+            name: (crop_window(mask, window) > 0.5) & inside
+            for name, mask in masks.items()
+            if mask is not None and mask.size
+        }
+        image, K = crop_window(self.image, window), window.through(self.K)
+        return replace(self, window=window, image=image, K=K, **seen)
 
     @cached_property
     def signed_distance(self) -> Plane:

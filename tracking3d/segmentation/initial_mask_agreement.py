@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.scene.surface import Drawn
 from tracking3d.segmentation.colour_models import near_outlines, relative_distance
-from tracking3d.segmentation.frame_window import FrameWindow
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 
 _FADING = 0.15
@@ -45,13 +45,13 @@ class InitialMaskAgreement:
 
     def __init__(self, vertices: NDArray[np.float64], slack: float = 1.0) -> None:
         self._hull, self._slack = SoftVisualHull(vertices), slack
-        self._scenes: list[FrameWindow] = []
+        self._scenes: list[Drawn] = []
         self.weight = 0.0
 
-    def see(self, scene: FrameWindow) -> None:
+    def see(self, scene: Drawn) -> None:
         """Add a frame whose pose is reliable."""
         if scene.initial.any():
-            self._hull.see(replace(scene, answer=scene.initial))
+            self._hull.see(replace(scene, mask=scene.initial))
             self._scenes.append(replace(scene, image=np.zeros((0, 0, 3), np.uint8)))
 
     def settle(self) -> None:
@@ -66,7 +66,7 @@ class InitialMaskAgreement:
             beyond, apart = np.median(known, 0) / self._slack
             self.weight = _falling(beyond, _BEYOND) * _falling(apart, _APART)
 
-    def of_frame(self, scene: FrameWindow) -> float:
+    def of_frame(self, scene: Drawn) -> float:
         """The weight of a frame's initial mask, in [0, 1]: less if it has another outline than the others."""
         difference = self._difference(scene) if self.weight else None
         if difference is None:
@@ -74,7 +74,7 @@ class InitialMaskAgreement:
         beyond, apart = np.array(difference) / self._slack
         return self.weight * _falling(beyond, _BEYOND_IN_FRAME) * _falling(apart, _APART_IN_FRAME)
 
-    def _difference(self, scene: FrameWindow) -> tuple[float, float] | None:
+    def _difference(self, scene: Drawn) -> tuple[float, float] | None:
         """How far an initial mask reaches beyond the hull, and how far apart both outlines are; None without a hull."""
         drawn = self._hull.drawn(scene)
         if drawn is None:

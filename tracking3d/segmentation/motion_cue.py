@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.segmentation.frame_window import FrameWindow, Mask, Plane
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import Mask, Plane
 
 _CORNERS, _LEAST_CORNERS = 300, 12
 _AGREEING = 0.3  # of the corners
@@ -77,17 +78,17 @@ def background_motion(
     return np.asarray(np.linalg.inv(to_small) @ H @ to_small)
 
 
-def flow_distance(scene: FrameWindow, camera: Camera, target: Target) -> float:
+def flow_distance(scene: Drawn, camera: Camera, target: Target) -> float:
     """Median of the frame pixels by which the two motions part in the answer; 0 if it cannot be told."""
     step = max(scene.window.size // 24, 1)
     parted = np.linalg.norm(
         _object_flow(scene, camera, target[1], step) - _background_flow(scene, target[2], step), axis=-1
     )
-    parted = parted[scene.answer[::step, ::step] & np.isfinite(parted)]
+    parted = parted[scene.mask[::step, ::step] & np.isfinite(parted)]
     return float(np.median(parted)) if parted.size else 0.0
 
 
-def motion_cue(scene: FrameWindow, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
+def motion_cue(scene: Drawn, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
     """``(2, S, S)`` log of how badly the background's motion explains a pixel over how badly the object's does.
 
     Args:
@@ -118,7 +119,7 @@ def motion_cue(scene: FrameWindow, camera: Camera, targets: Sequence[Target]) ->
 
 
 def _motion_parallax(
-    scene: FrameWindow, camera: Camera, target: Target
+    scene: Drawn, camera: Camera, target: Target
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where pixels are in another frame.
 
@@ -159,13 +160,13 @@ def motion_parallax(
     )
 
 
-def _through(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
+def _through(scene: Drawn, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
     """``(3, 3)`` and ``(3,)`` that take the window's ``u, v, 1`` and one over a depth to the other frame's pixels."""
     T = T_cam_obj @ np.linalg.inv(scene.T_cam_obj)
     return camera.K @ T[:3, :3] @ np.linalg.inv(scene.K), camera.K @ T[:3, 3]
 
 
-def _object_flow(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _object_flow(scene: Drawn, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN if there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
@@ -173,7 +174,7 @@ def _object_flow(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix, step: in
     return _project(np.where(inverse_depth > 0, moved, np.nan))
 
 
-def _background_flow(scene: FrameWindow, H: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _background_flow(scene: Drawn, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
     return _project(_carry_through(scene.window.size, H @ scene.window.to_frame, step))
 

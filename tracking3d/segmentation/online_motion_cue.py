@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.geometry.camera import Camera, Window
+from tracking3d.scene.surface import draw_depth
+from tracking3d.scene.view import Mask, Plane
 from tracking3d.segmentation.colour_models import relative_distance
-from tracking3d.segmentation.frame_window import Mask, Plane, surface_in
 from tracking3d.segmentation.motion_cue import background_motion, motion_parallax, smaller
 from tracking3d.trackers.colour_models import histograms, log_ratio
 
@@ -92,7 +93,8 @@ def online_motion_log_odds(
         None if no earlier frame can tell.
     """
     seen = Window(window.left, window.top, window.side, min(window.size, _LARGEST))
-    drawn, inverse_depth = surface_in(seen.K(camera), here.T_cam_obj, vertices, faces, seen.size)
+    inverse_depth, beyond = draw_depth(seen.K(camera), here.T_cam_obj, vertices, faces, seen.shape)
+    drawn = beyond == 0
     if not earlier or not drawn.any():
         return None
     ways = _ways_apart(here, earlier, seen, camera, drawn, inverse_depth)

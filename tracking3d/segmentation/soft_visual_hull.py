@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.segmentation.frame_window import FrameWindow
+from tracking3d.scene.surface import Drawn
 from tracking3d.trackers.outline import inside_distance
 
 CELLS = 64
@@ -40,16 +40,16 @@ class SoftVisualHull:
         self._views: list[NDArray[np.int8]] = []
         self._hulls: NDArray[np.float32] | None = None
 
-    def see(self, scene: FrameWindow) -> None:
+    def see(self, scene: Drawn) -> None:
         """Add a frame whose pose and mask are trusted."""
         # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
-        distance = np.clip(inside_distance(scene.answer), -size, size)
+        distance = np.clip(inside_distance(scene.mask), -size, size)
         P = scene.K @ scene.T_cam_obj[:3]
         step = self._side / CELLS
         to_pixels = np.column_stack([step * P[:, :3], P[:, :3] @ (self._low + step / 2) + P[:, 3]])
         by_depth = 1 / (float(scene.K[0, 0]) * self._unit)
-        values = sample_grid_distances(distance, ~scene.valid, to_pixels, by_depth, -size)
+        values = sample_grid_distances(distance, ~scene.in_frame, to_pixels, by_depth, -size)
         if values is not None:
             self._views.append(values)
 
@@ -67,7 +67,7 @@ class SoftVisualHull:
         self._hulls = sharpen_peaks(hull.reshape(len(RANKS), CELLS, CELLS, CELLS))
         self._views = []
 
-    def drawn(self, scene: FrameWindow) -> NDArray[np.float32] | None:
+    def drawn(self, scene: Drawn) -> NDArray[np.float32] | None:
         """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None if they are not known."""
         if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None

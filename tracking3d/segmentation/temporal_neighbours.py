@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.geometry.camera import Camera
-from tracking3d.segmentation.frame_window import Answered, FrameWindow
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation.motion_cue import Target, background_motion, flow_distance, small_grey
 
 STEPS = (1, 2, 3, 5, 8)
@@ -21,7 +22,7 @@ _ENOUGH = 4.0  # frame pixels that the motions are apart, from which on the near
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    frame: Answered
+    frame: ObjectView
     grey: NDArray[np.uint8]
     to_next: NDArray[np.float64] | None = None
 
@@ -39,23 +40,23 @@ class TemporalNeighbours:
         """The frames that are known now; what is added later is not."""
         return TemporalNeighbours(self._links)
 
-    def add(self, frame: Answered) -> None:
+    def add(self, frame: ObjectView) -> None:
         """The next frame; frames further back than twice `REACH` are forgotten."""
         grey = small_grey(frame.image)
         if self._links and self._links[-1].grey.shape == grey.shape:
             last = self._links.pop()
-            hidden = last.frame.initial | last.frame.answer
+            hidden = last.frame.initial | last.frame.mask
             self._links.append(_Link(last.frame, last.grey, background_motion(last.grey, grey, hidden)))
         self._links.append(_Link(frame, grey))
 
-    def around(self, index: int, scene: FrameWindow, camera: Camera) -> list[Target]:
+    def around(self, index: int, scene: Drawn, camera: Camera) -> list[Target]:
         """The nearest frame on either side of frame ``index`` at which the motions part; the farthest if none does."""
         if not np.isfinite(scene.T_cam_obj).all():
             return []
         (place,) = (at for at, link in enumerate(self._links) if link.frame.index == index)
         return [found for side in (-1, 1) if (found := self._beside(place, side, scene, camera))]
 
-    def _beside(self, place: int, side: int, scene: FrameWindow, camera: Camera) -> Target | None:
+    def _beside(self, place: int, side: int, scene: Drawn, camera: Camera) -> Target | None:
         H, found, at = np.eye(3), None, place
         for step in STEPS:
             while at != place + side * step:

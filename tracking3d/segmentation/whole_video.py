@@ -17,24 +17,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import Camera, Window
 from tracking3d.runtime.concurrency import OrderedExecutor
+from tracking3d.scene.surface import Drawn, draw
+from tracking3d.scene.view import Mask, ObjectView, Plane
 from tracking3d.segmentation.colour_models import (
     ColourModels,
-    as_lab,
     beside_outline,
     outline_difference,
     relative_distance,
 )
-from tracking3d.segmentation.frame_window import Answered, FrameWindow, Mask, Plane
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement, smoothing_of
 from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
 from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
+from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.outline import inside_distance
 
+LARGEST = 320
+"""Pixels of a window's side; a larger one is seen smaller."""
+_MARGIN = 0.2  # beside the masks, relative to their longer side
 _LEAST_CONFIDENCE = 0.5
 """Of the frames that are combined; all if none has it."""
 MOST_VIEWS = 24
@@ -44,6 +48,24 @@ _ASKED = 0.4
 _AT_A_TIME = 2
 """Frames that are decided at a time, in as many threads as OpenCV may take at most."""
 _MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is another object's
+
+
+def draw_around_masks(
+    frame: ObjectView, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> Drawn | None:
+    """A whole frame seen through the window around its masks, with the surface in it; None if both are empty.
+
+    Args:
+        frame: The frame.
+        vertices: ``(V, 3)`` of the object.
+        faces: ``(F, 3)``.
+    """
+    box = box_of(frame.initial | frame.mask)
+    if box is None:
+        return None
+    window = Window.around(box, _MARGIN, 1)
+    window = Window(window.left, window.top, window.side, min(window.side, LARGEST))
+    return draw(frame.at(window), vertices, faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +119,17 @@ class VideoSegmenter:
         self._consensus = SoftVisualHull(vertices)
         self._agreement = InitialMaskAgreement(vertices) if has_given_masks else None
         self._colours: ColourModels | None = None
-        self.order, self._waiting = TemporalNeighbours(), deque[Answered]()
+        self.order, self._waiting = TemporalNeighbours(), deque[ObjectView]()
         self._jobs: OrderedExecutor | None = None
 
-    def see(self, frame: Answered) -> None:
+    def see(self, frame: ObjectView) -> None:
         """A frame for the first time, in the order of time; some of them are put together."""
         self._seen.append(frame.index)
         wanted, may_keep = frame.index in self._wanted, frame.index in self._may_keep
         if not (wanted or may_keep) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = self._scene(frame)
-        if scene is None or not scene.answer.any():
+        if scene is None or not scene.mask.any():
             return
         if may_keep and _least_iou(scene) > self._least_agreement:
             self.kept.add(frame.index)
@@ -115,7 +137,7 @@ class VideoSegmenter:
             self._consensus.see(scene)
             if self._agreement is not None:
                 self._agreement.see(scene)
-            self._colours = ColourModels.of(as_lab(scene.image), scene.answer, self._colours, scene.occluder)
+            self._colours = ColourModels.of(scene.lab, scene.mask, self._colours, scene.occluder)
 
     def settle(self) -> None:
         """All frames were seen a first time."""
@@ -132,7 +154,7 @@ class VideoSegmenter:
         """Whether a frame is decided, or tells the motion around one that is; before any other comes `rest`."""
         return index in self._shown
 
-    def decide(self, frame: Answered) -> Iterator[tuple[int, SegmentedMask | None]]:
+    def decide(self, frame: ObjectView) -> Iterator[tuple[int, SegmentedMask | None]]:
         """A frame for the second time.
 
         Args:
@@ -155,32 +177,32 @@ class VideoSegmenter:
         self.order = TemporalNeighbours()
 
     def said(
-        self, frame: Answered, order: TemporalNeighbours | None = None
-    ) -> tuple[FrameWindow, PixelEvidence] | None:
+        self, frame: ObjectView, order: TemporalNeighbours | None = None
+    ) -> tuple[Drawn, PixelEvidence] | None:
         """What the sources say of one of the latest frames; None if it has no masks or no pose.
 
         Args:
             frame: The frame.
             order: Those around it; `order` as it is, if left out.
         """
-        if not frame.initial.any() or not frame.answer.any() or not np.isfinite(frame.T_cam_obj).all():
+        if not frame.initial.any() or not frame.mask.any() or not np.isfinite(frame.T_cam_obj).all():
             return None
         scene = self._scene(frame)
-        if scene is None or not scene.initial.any() or not scene.answer.any():
+        if scene is None or not scene.initial.any() or not scene.mask.any():
             return None
         around = (order or self.order).around(frame.index, scene, self._camera)
         motion = motion_cue(scene, self._camera, around)
         return scene, PixelEvidence.of(scene, self._consensus.drawn(scene), self._colours, motion)
 
-    def _scene(self, frame: Answered) -> FrameWindow | None:
-        return FrameWindow.of(frame, self._camera, self._vertices, self._faces)
+    def _scene(self, frame: ObjectView) -> Drawn | None:
+        return draw_around_masks(frame, self._vertices, self._faces)
 
-    def _begin(self, frame: Answered) -> Iterator[tuple[int, SegmentedMask | None]]:
+    def _begin(self, frame: ObjectView) -> Iterator[tuple[int, SegmentedMask | None]]:
         if self._jobs is None:  # as many threads as there are where frames are decided
             self._jobs = OrderedExecutor(min(cv2.getNumThreads(), _AT_A_TIME))
         yield from self._jobs.do(partial(self._decided, frame, self.order.as_it_is()))
 
-    def _decided(self, frame: Answered, order: TemporalNeighbours) -> tuple[int, SegmentedMask | None]:
+    def _decided(self, frame: ObjectView, order: TemporalNeighbours) -> tuple[int, SegmentedMask | None]:
         if self._due is not None and frame.index not in self._due:
             return frame.index, None
         if not pose_weight(frame.confidence):
@@ -200,17 +222,15 @@ class VideoSegmenter:
             odds = np.where(scene.occluder, shape_log_odds(behind), odds)
         odds = blend_with_initial(odds, scene.initial, weight)
         support = clean_mask(snap_to_edges(scene.image, odds, smoothing_of(initial_weight) * _ASKED))
-        support = np.where(scene.valid, support, -1).astype(np.float32)
-        full = paste_window(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
+        support = np.where(scene.in_frame, support, -1).astype(np.float32)
+        full = paste_window(support, scene.window, np.full(frame.frame_size, -1, np.float32))
         mask = full > 0
-        common, either = (
-            np.count_nonzero(way(mask, frame.answer)) for way in (np.logical_and, np.logical_or)
-        )
+        common, either = (np.count_nonzero(way(mask, frame.mask)) for way in (np.logical_and, np.logical_or))
         if common < (1 - _MOST_CHANGE) * either:
             return frame.index, None
         return frame.index, SegmentedMask(frame.index, mask, 0.5 + 0.5 * full)
 
-    def _initial_weight(self, frame: Answered) -> float:
+    def _initial_weight(self, frame: ObjectView) -> float:
         """The weight of an initial mask because it agrees with those of other frames; 0 if the user gave none."""
         if self._agreement is None or not frame.initial.any() or not np.isfinite(frame.T_cam_obj).all():
             return 0.0
@@ -218,16 +238,16 @@ class VideoSegmenter:
         return 0.0 if scene is None or not scene.initial.any() else self._agreement.of_frame(scene)
 
 
-def _least_iou(scene: FrameWindow) -> float:
+def _least_iou(scene: Drawn) -> float:
     """The lower IoU of a frame's mask with the silhouette and with the initial mask, where there is one."""
-    others = [scene.drawn & scene.valid, *([scene.initial] if scene.initial.any() else [])]
+    others = [scene.silhouette, *([scene.initial] if scene.initial.any() else [])]
     return min(
-        np.count_nonzero(scene.answer & other) / np.count_nonzero(scene.answer | other) for other in others
+        np.count_nonzero(scene.mask & other) / np.count_nonzero(scene.mask | other) for other in others
     )
 
 
 def segment_all(
-    hindsight: VideoSegmenter, frames: Iterable[Answered]
+    hindsight: VideoSegmenter, frames: Iterable[ObjectView]
 ) -> Iterator[tuple[int, SegmentedMask | None]]:
     """Every frame of a video whose frames were all seen once, in their order."""
     for frame in frames:
@@ -309,7 +329,7 @@ class PixelEvidence:
 
     @classmethod
     def of(
-        cls, scene: FrameWindow, hulls: Plane | None, colours: ColourModels | None, motion: Plane
+        cls, scene: Drawn, hulls: Plane | None, colours: ColourModels | None, motion: Plane
     ) -> PixelEvidence:
         """Ask all of them.
 
@@ -319,19 +339,19 @@ class PixelEvidence:
             colours: What all frames that are trusted show, or None.
             motion: From `tracking3d.segmentation.motion_cue.motion_cue`.
         """
-        lab = as_lab(scene.image)
-        masks = {"initial": scene.initial, "answer": scene.answer}
-        masks |= {"drawn": scene.drawn} if scene.drawn.any() else {}
+        lab = scene.lab
+        masks = {"initial": scene.initial, "answer": scene.mask}
+        masks |= {"drawn": scene.silhouette} if scene.silhouette.any() else {}
         outlines = {name: inside_distance(mask) for name, mask in masks.items()}
         distances = {name: relative_distance(mask, outlines[name]) for name, mask in masks.items()}
         if hulls is not None:
-            root = math.sqrt(max(int(np.count_nonzero(scene.answer)), 1))
+            root = math.sqrt(max(int(np.count_nonzero(scene.mask)), 1))
             named = dict(zip(("hull", "wide hull"), hulls, strict=True))
             distances |= {name: hull / root for name, hull in named.items()}
             outlines |= {name: inside_distance(hull > 0) for name, hull in named.items()}
         edges = edge_strength(lab)
         alignments = {name: alignment(edges, outline) for name, outline in outlines.items()}
-        nearby = beside_outline(lab, scene.answer) if scene.answer.any() else np.zeros_like(edges)
+        nearby = beside_outline(lab, scene.mask) if scene.mask.any() else np.zeros_like(edges)
         remembered = np.zeros_like(edges) if colours is None else colours.log_ratio(lab)
         return cls(distances, alignments, np.stack([nearby, remembered]), motion, scene.confidence)
 

@@ -17,8 +17,9 @@ from tracking3d.estimation.online.state.solver_state import MaskAgreement, Solve
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
-from tracking3d.segmentation.frame_window import Answered, FrameWindow
+from tracking3d.scene.view import ObjectView
 from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
+from tracking3d.segmentation.whole_video import draw_around_masks
 
 
 def initial_estimate(
@@ -149,12 +150,11 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
         assert view.mask is not None
         image = np.zeros((*view.mask.shape, 3), np.uint8)
         T_cam_obj = view.pose.matrix().numpy().astype(np.float64)
-        scene = FrameWindow.of(
-            Answered(view.index, image, view.mask, view.mask, T_cam_obj, 1.0), camera, vertices, faces
-        )
-        if scene is not None:
-            found.see(scene)
-            beyond.append(share_beyond(scene.initial, scene.drawn))
+        frame = ObjectView.of_frame(view.index, image, view.mask, camera, T_cam_obj, initial=view.mask)
+        drawn = draw_around_masks(frame, vertices, faces)
+        if drawn is not None:
+            found.see(drawn)
+            beyond.append(share_beyond(drawn.initial, drawn.silhouette))
     found.settle()
     usual = float(np.median(beyond)) if beyond else 0.0
     return MaskAgreement(found.weight, usual, len(object_map.keyframes))
