@@ -75,6 +75,6 @@ def view(
     """A view of the ball."""
     T_cam_obj = pose(yaw, pitch)
     image, mask = seen(T_cam_obj, pattern() if texture is None else texture)
-    found = texture_view(index, image, mask, CAMERA, T_cam_obj)
+    found = texture_view(ObjectView.of_frame(index, image, mask, CAMERA, T_cam_obj))
     assert found is not None
     return found

@@ -13,6 +13,7 @@ from tracking3d.reconstruction import bake_texture
 from tracking3d.reconstruction import held_out_test as module
 from tracking3d.reconstruction.held_out_test import held_out_scores
 from tracking3d.reconstruction.views import shape_view
+from tracking3d.scene.view import ObjectView
 
 pytest.importorskip("skimage", reason="the extra model is not installed")
 
@@ -22,7 +23,7 @@ YAWS, OUT = (0, 15, 30, 45), 20
 @pytest.fixture(scope="module")
 def out():
     image, mask = seen(pose(OUT), pattern())
-    return shape_view(0, image, mask, CAMERA, pose(OUT)), view(0, OUT)
+    return shape_view(ObjectView.of_frame(0, image, mask, CAMERA, pose(OUT))), view(0, OUT)
 
 
 def test_the_right_model_predicts_what_a_wrong_one_does_not(out):

@@ -103,7 +103,7 @@ def views_of_the_corner() -> list[ObjectView]:
         image, frame = np.zeros((160, 160, 3), np.uint8), np.ones((160, 160), bool)
         everywhere = ObjectView.of_frame(index, image, frame, CAMERA, T_cam_obj)
         mask = np.isfinite(guide.visible_to(everywhere)[0])
-        seen = shape_view(index, image, mask, CAMERA, T_cam_obj)
+        seen = shape_view(ObjectView.of_frame(index, image, mask, CAMERA, T_cam_obj))
         assert seen is not None
         views.append(seen)
     return views

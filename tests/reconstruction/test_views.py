@@ -11,12 +11,13 @@ import pytest
 from rendered_views import CAMERA, pattern, pose, seen, view
 
 from tracking3d.reconstruction import keep_best_views, texture_view
+from tracking3d.scene.view import ObjectView
 
 
 def test_a_view_is_the_frame_around_the_object_at_its_own_resolution():
     T_cam_obj = pose(20)
     image, mask = seen(T_cam_obj, np.full((8, 8, 3), 0.5, np.float32))
-    found = texture_view(7, image, mask, CAMERA, T_cam_obj)
+    found = texture_view(ObjectView.of_frame(7, image, mask, CAMERA, T_cam_obj))
     assert found is not None and found.index == 7
     rows, columns = np.nonzero(mask)
     extent = max(np.ptp(rows), np.ptp(columns)) + 1
@@ -40,13 +41,13 @@ def test_without_an_inside_there_is_no_view(mask):
     image, object_ = seen(pose(0), np.full((8, 8, 3), 0.5, np.float32))
     object_[:] = False
     object_[40:41, 40:41] = mask == "a speck"
-    assert texture_view(0, image, object_, CAMERA, pose(0)) is None
+    assert texture_view(ObjectView.of_frame(0, image, object_, CAMERA, pose(0))) is None
 
 
 def test_a_large_object_is_seen_smaller():
     image, mask = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000), bool)
     mask[100:1900, 100:1900] = True
-    found = texture_view(0, image, mask, CAMERA, pose(0))
+    found = texture_view(ObjectView.of_frame(0, image, mask, CAMERA, pose(0)))
     assert found is not None
     assert len(found.image) == len(found.interior) == 640
 
@@ -62,7 +63,7 @@ def test_those_that_are_kept_are_spread_over_all_that_was_seen():
 
 def test_of_two_that_see_the_same_the_sharper_one_stays():
     image, mask = seen(pose(0), pattern())
-    blurred = texture_view(1, cv2.GaussianBlur(image, (0, 0), 3), mask, CAMERA, pose(0))
+    blurred = texture_view(ObjectView.of_frame(1, cv2.GaussianBlur(image, (0, 0), 3), mask, CAMERA, pose(0)))
     sharp, other = view(0, 0.0), view(2, 90.0)
     assert blurred is not None and blurred.sharpness < 0.5 * sharp.sharpness
     for order in ((blurred, sharp, other), (other, sharp, blurred)):

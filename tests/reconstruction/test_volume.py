@@ -30,7 +30,7 @@ def shape_views(yaws, pitch: float = 0.0) -> list[ObjectView]:
     views = []
     for index, yaw in enumerate(yaws):
         image, mask = seen(pose(yaw, pitch), pattern())
-        views.append(shape_view(index, image, mask, CAMERA, pose(yaw, pitch), SIDE))
+        views.append(shape_view(ObjectView.of_frame(index, image, mask, CAMERA, pose(yaw, pitch)), SIDE))
     return views
 
 

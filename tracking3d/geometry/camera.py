@@ -126,27 +126,26 @@ class Camera:
 
 @dataclass(frozen=True)
 class Window:
-    """A region of the frame seen at other pixels, square or not; it may reach beyond the frame.
+    """A region of the frame seen at other pixels, square or not; it may reach beyond the frame."""
 
-    Attributes:
-        left, top: Outer edge of the region: the column and row of its first pixel in the frame.
-        side: Width of the region in frame pixels; of a square one its side.
-        size: The same in window pixels.
-        rows: Height of the region in frame pixels and in window pixels, if it is not square.
-    """
-
-    left: int
-    top: int
-    side: int
-    size: int
-    rows: tuple[int, int] | None = None
+    left: int  # outer edge of the region: the column of its first pixel in the frame
+    top: int  # the row of that pixel
+    side: int  # width of the region in frame pixels, and its height if it is square
+    size: int  # the same in window pixels
+    rows: tuple[int, int] | None = None  # height in frame pixels and in window pixels, if it is not square
 
     @classmethod
-    def around(cls, box: tuple[float, float, float, float], margin: float, size: int) -> Window:
-        """The square window centred on ``box`` ``(x, y, w, h)``, ``1 + 2 margin`` times its longer side."""
+    def around(
+        cls, box: tuple[float, float, float, float], margin: float, size: int, enlarge: bool = True
+    ) -> Window:
+        """The square window centred on ``box`` ``(x, y, w, h)``, ``1 + 2 margin`` times its longer side.
+
+        Without ``enlarge``, a smaller region than ``size`` is seen as it is.
+        """
         x, y, width, height = box
         side = max(round(max(width, height) * (1.0 + 2.0 * margin)), 4)
-        return cls(round(x + width / 2 - side / 2), round(y + height / 2 - side / 2), side, size)
+        left, top = round(x + width / 2 - side / 2), round(y + height / 2 - side / 2)
+        return cls(left, top, side, size if enlarge else min(side, size))
 
     @property
     def scale(self) -> float:

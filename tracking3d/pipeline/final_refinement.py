@@ -132,7 +132,7 @@ class FinalRefinement:
         if most and record.status is Status.TRACKED:
             camera = record.through(self._session.camera)
             image, seen = camera.undistort(frame.image), camera.mask_to_pinhole(visible)
-            view = texture_view(frame.index, image, seen, camera, record.T_cam_obj)
+            view = texture_view(ObjectView.of_frame(frame.index, image, seen, camera, record.T_cam_obj))
             self._views = self._views if view is None else keep_best_views(self._views, view, most)
         return record
 

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import spsolve
 from tracking3d.geometry.camera import Window
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
-from tracking3d.scene.surface import Drawn
+from tracking3d.scene.surface import Drawn, camera_tensors
 from tracking3d.scene.view import ObjectView
 
 STEPS = 3
@@ -76,11 +76,9 @@ def _equations(
     view: ObjectView,
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
     """How the distances of the contour's points change with displacements ``(N, V)``, and what they are ``(N,)``."""
-    T = torch.from_numpy(view.T_cam_obj[None]).float()
-    K = torch.from_numpy(view.K[None]).float()
     drawn = render(
         torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.zeros(len(faces), 3, 2),
-        torch.zeros(1, 2, 2), T[:, :3, :3], T[:, :3, 3], K, view.window.shape,
+        torch.zeros(1, 2, 2), *camera_tensors(view), view.window.shape,
     )  # fmt: skip
     contour = find_contour(drawn)
     residual, slope = contour_slopes(contour, torch.from_numpy(-view.signed_distance[None]))

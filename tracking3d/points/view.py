@@ -47,7 +47,9 @@ def cut_window(
     if not (depth > NEAR).all():
         return None
     size = np.array([camera.width, camera.height])
-    pixels = np.concatenate([xy, _corners_of(mask)])
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    corners = [(x, y), (x + width - 1, y + height - 1)] if width else []
+    pixels = np.concatenate([xy, np.reshape(corners, (-1, 2))])
     low = np.clip(np.floor(pixels.min(0)) - MARGIN, 0, size).astype(int)
     high = np.clip(np.ceil(pixels.max(0)) + MARGIN + 1, 0, size).astype(int)
     if (high - low < 8).any():
@@ -60,26 +62,10 @@ def cut_window(
     return FrameCrop(window, grey, mask.shape, crop_window(mask.astype(np.uint8) * np.uint8(255), window))
 
 
-def _corners_of(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """``(2, 2)`` the first and the last column and row of a mask; ``(0, 2)`` of an empty one."""
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if not width:
-        return np.zeros((0, 2), np.int64)
-    return np.array([[left, top], [left + width - 1, top + height - 1]])
-
-
 def draw_into_window(
     crop: FrameCrop, camera: Camera, T_cam_obj: Array, vertices: Array, faces: NDArray[np.int64]
 ) -> Drawn:
-    """A window of `cut_window` with the mesh drawn into it.
-
-    Args:
-        crop: The window.
-        camera: The camera of the frame.
-        T_cam_obj: ``(4, 4)``.
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``.
-    """
+    """A window of `cut_window` with the mesh drawn into it, ``(V, 3)`` vertices and ``(F, 3)`` faces."""
     assert crop.mask is not None
     view = ObjectView(
         crop.window, cv2.GaussianBlur(crop.image.astype(np.float32), (0, 0), 0.5), crop.frame_size,
@@ -97,20 +83,7 @@ def open_view(
     faces: NDArray[np.int64],
     longest_side: int = LONGEST_SIDE,
 ) -> Drawn | None:
-    """The window of a frame around its mask and the projected mesh, with the mesh drawn into it.
-
-    Args:
-        image: ``(H, W, 3)`` RGB.
-        mask: ``(H, W)``.
-        camera: The camera of the frame.
-        T_cam_obj: ``(4, 4)``.
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``.
-        longest_side: Pixels of the window; a larger one is scaled down.
-
-    Returns:
-        The view, or None if the pose is no number or nothing of the object lies in the frame.
-    """
+    """`cut_window` and `draw_into_window` at once."""
     window = cut_window(image, mask, camera, T_cam_obj, vertices, longest_side)
     return None if window is None else draw_into_window(window, camera, T_cam_obj, vertices, faces)
 

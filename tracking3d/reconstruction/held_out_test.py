@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.photometric_poses import coloured_surface, refine_views
 from tracking3d.rendering import render
+from tracking3d.scene.surface import camera_tensors
 from tracking3d.scene.view import ObjectView
 
 EVERY = 8
@@ -61,10 +62,9 @@ def score_held_out(
     surface = coloured_surface(vertices, faces, views)
     overlaps, differences = [], []
     for view in refine_views(surface, left_out):
-        T = torch.from_numpy(view.T_cam_obj[None]).float()
         drawn = render(
-            surface.vertices, surface.faces, surface.face_uvs, surface.texture, T[:, :3, :3], T[:, :3, 3],
-            torch.from_numpy(view.K[None]).float(), (len(view.mask), len(view.mask)),
+            surface.vertices, surface.faces, surface.face_uvs, surface.texture,
+            *camera_tensors(view), view.window.shape,
         )  # fmt: skip
         covered, mask = drawn.face_index[0].numpy() >= 0, view.mask
         either = (covered | mask) & view.in_frame
@@ -103,27 +103,25 @@ def held_out_scores(
     """
     surface = coloured_surface(model.vertices, model.faces, used)
     fitted = refine_views(surface, [shape for shape, _ in left_out])
-    each = [_compare(model, view, shape.T_cam_obj) for shape, (_, view) in zip(fitted, left_out, strict=True)]
+    each = [
+        _compare(model, replace(view, T_cam_obj=shape.T_cam_obj))
+        for shape, (_, view) in zip(fitted, left_out, strict=True)
+    ]
     psnr, ssim, covered = np.mean(each, axis=0)
     return HeldOutScores(len(each), float(psnr), float(ssim), float(covered))
 
 
-def _compare(
-    model: ObjectModel, view: ObjectView, T_cam_obj: NDArray[np.float64]
-) -> tuple[float, float, float]:
+def _compare(model: ObjectModel, view: ObjectView) -> tuple[float, float, float]:
     from kornia.metrics import psnr
     from skimage.metrics import structural_similarity
 
-    T = torch.from_numpy(T_cam_obj[None]).float()
     drawn = render(
         torch.from_numpy(model.vertices).float(),
         torch.from_numpy(model.faces),
         torch.from_numpy(model.face_uvs).float(),
         torch.from_numpy(model.texture).permute(2, 0, 1).float() / 255,
-        T[:, :3, :3],
-        T[:, :3, 3],
-        torch.from_numpy(view.K[None]).float(),
-        (len(view.image), len(view.image)),
+        *camera_tensors(view),
+        view.window.shape,
     )
     picture, inside = view.image / 255.0, view.interior > 0
     covered = drawn.face_index[0].numpy() >= 0

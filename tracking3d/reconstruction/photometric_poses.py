@@ -26,6 +26,7 @@ from tracking3d.rendering import (
     pose_terms,
 )
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.surface import camera_tensors, image_tensor
 from tracking3d.scene.view import ObjectView
 
 COLOUR, OUTLINE = 0.1, 2.0
@@ -52,10 +53,10 @@ def coloured_surface(
     texels = TexelMap.of(uvs, size)
     seen = BackProjection(torch.zeros(3, size, size), torch.zeros(size, size))
     for view in views:
-        R, t, K = _place_surface(view)
+        R, t, K = (part[0] for part in camera_tensors(view))
         # A pixel or two within the outline colours are mixed with the background's.
         valid = torch.from_numpy(np.clip((view.signed_distance - 1) / 2, 0, 1))
-        seen = seen + back_project(_picture(view), valid, points, corners, texels, R, t, K)
+        seen = seen + back_project(image_tensor(view), valid, points, corners, texels, R, t, K)
     # Between the cells texels continue the nearest one on a face: samples at a face's edge mix with them.
     uncovered = np.ones((size, size), np.bool_)
     uncovered.flat[texels.texel.numpy()] = False
@@ -82,7 +83,7 @@ def _fit_pose(surface: Surface, view: ObjectView) -> NDArray[np.float64]:
     mask = torch.from_numpy(view.mask)
     target = PoseTarget(
         torch.from_numpy(view.K).float(),
-        _picture(view),
+        image_tensor(view),
         mask.float(),
         torch.from_numpy(view.in_frame),
         mask,
@@ -118,12 +119,3 @@ def _cost(
     terms = pose_terms(surface, target, R, t, None, Scales(COLOUR, OUTLINE, 1.0))
     model = terms.appearance + terms.outline * OUTLINE_WEIGHT
     return float(model.cost[0]), model.matrix[0].numpy(), model.gradient[0].numpy()
-
-
-def _place_surface(view: ObjectView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    T = torch.from_numpy(view.T_cam_obj).float()
-    return T[:3, :3], T[:3, 3], torch.from_numpy(view.K).float()
-
-
-def _picture(view: ObjectView) -> torch.Tensor:
-    return torch.from_numpy(view.image).permute(2, 0, 1).float() / 255

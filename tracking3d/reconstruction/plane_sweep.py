@@ -23,6 +23,7 @@ from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.runtime.progress import report_each
+from tracking3d.scene.surface import camera_tensors
 from tracking3d.scene.view import ObjectView
 
 NEIGHBOURS, AGREEING = 6, 3
@@ -58,10 +59,9 @@ class Guide:
 
     def visible_to(self, view: ObjectView) -> tuple[FloatArray, FloatArray]:
         """Depth ``(S, S)``, infinite outside the surface, and unit normals ``(S, S, 3)`` in camera coordinates."""
-        R = torch.from_numpy(view.T_cam_obj[None, :3, :3]).float()
-        t = torch.from_numpy(view.T_cam_obj[None, :3, 3]).float()
+        R, t, K = camera_tensors(view)
         vertices, faces = torch.from_numpy(self.vertices).float(), torch.from_numpy(self.faces)
-        screen, z = project(vertices, R, t, torch.from_numpy(view.K[None]).float())
+        screen, z = project(vertices, R, t, K)
         size = view.window.shape
         drawn = rasterize(screen, z, faces, size)
         turned = (vertex_normals(vertices, faces) @ R[0].T)[faces]

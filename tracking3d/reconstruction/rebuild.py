@@ -72,7 +72,9 @@ def retexture_run(
     views: tuple[ObjectView, ...] = ()
     for frame, record in reliable_frames(run, source):
         mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
-        view = texture_view(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
+        view = texture_view(
+            ObjectView.of_frame(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
+        )
         views = views if view is None else keep_best_views(views, view, most)
     if not views:
         raise no_reliable_frame_error(run)

@@ -167,8 +167,11 @@ def collect_views(
 def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ObjectView, ObjectView] | None:
     """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
     pose = run.camera_of(record), np.asarray(record.T_cam_obj)
-    shape = shape_view(frame.index, frame.image, run.pinhole_mask(frame.index), *pose)
-    view = texture_view(frame.index, frame.image, run.visible_pinhole_mask(frame.index), *pose)
+    whole, visible = (
+        ObjectView.of_frame(frame.index, frame.image, mask, *pose)
+        for mask in (run.pinhole_mask(frame.index), run.visible_pinhole_mask(frame.index))
+    )
+    shape, view = shape_view(whole), texture_view(visible)
     return None if shape is None or view is None else (shape, view)
 
 

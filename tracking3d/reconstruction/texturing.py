@@ -29,6 +29,7 @@ from tracking3d.rendering.backend import give_threads, threads_kept
 from tracking3d.rendering.backprojection import SeenTexels
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.scene.surface import camera_tensors, image_tensor
 from tracking3d.scene.view import ObjectView
 
 _SMALLEST = 64
@@ -209,16 +210,10 @@ def _divide_safely(total: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _seen(model: ObjectModel, texels: TexelMap, view: ObjectView) -> Seen:
-    seen = seen_texels(
-        torch.from_numpy(view.image).permute(2, 0, 1).float() / 255,
-        torch.from_numpy(view.interior),
-        torch.from_numpy(model.vertices).float(),
-        torch.from_numpy(model.faces),
-        texels,
-        torch.from_numpy(view.T_cam_obj[:3, :3]).float(),
-        torch.from_numpy(view.T_cam_obj[:3, 3]).float(),
-        torch.from_numpy(view.K).float(),
-    )
+    R, t, K = camera_tensors(view)
+    vertices, faces = torch.from_numpy(model.vertices).float(), torch.from_numpy(model.faces)
+    valid = torch.from_numpy(view.interior)
+    seen = seen_texels(image_tensor(view), valid, vertices, faces, texels, R[0], t[0], K[0])
     return seen.texel.numpy(), seen.values.numpy(), seen.weight.numpy()
 
 
@@ -340,15 +335,13 @@ def _find_missing_details(
     gain: FloatArray,
 ) -> tuple[ObjectView, SeenTexels]:
     """The difference between what a view shows of its texels and what the texture predicts."""
-    R = torch.from_numpy(view.T_cam_obj[:3, :3]).float()
-    t, K = torch.from_numpy(view.T_cam_obj[:3, 3]).float(), torch.from_numpy(view.K).float()
-    size = view.window.shape
-    drawn = render(*surface, face_uvs, colours, R[None], t[None], K[None], size)
+    R, t, K = camera_tensors(view)
+    drawn = render(*surface, face_uvs, colours, R, t, K, view.window.shape)
     predicted = drawn.image()[0].permute(1, 2, 0).numpy()
     valid = view.interior * (drawn.face_index[0].numpy() >= 0)
     difference, valid = _remove_light(view.image * (gain / 255) - predicted, valid)
     layers = torch.from_numpy(difference).permute(2, 0, 1)
-    return view, seen_texels(layers, torch.from_numpy(valid), *surface, texels, R, t, K)
+    return view, seen_texels(layers, torch.from_numpy(valid), *surface, texels, R[0], t[0], K[0])
 
 
 def _add(total: FloatArray, weight: FloatArray, done: tuple[ObjectView, SeenTexels], sharpest: float) -> None:

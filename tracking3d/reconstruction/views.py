@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tracking3d.frames import Image
-from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.camera import Window
 from tracking3d.scene.view import ObjectView
 from tracking3d.trackers.crops import box_of
 
@@ -18,40 +16,21 @@ _LARGEST = 640  # pixels of the side of a view that a texture is taken from; a l
 _MARGIN, _TEXTURE_MARGIN = 0.08, 0.05  # around the mask, relative to its longer side
 
 
-def texture_view(
-    index: int, image: Image, mask: NDArray[np.bool_], camera: Camera, T_cam_obj: NDArray[np.float64]
-) -> ObjectView | None:
-    """A frame as a texture is taken from it; None if its mask is empty or too small to have an inside.
-
-    Args:
-        index: Index of the frame.
-        image: ``(H, W, 3)`` RGB.
-        mask: ``(H, W)`` the object.
-        camera: Camera of the full frame.
-        T_cam_obj: ``(4, 4)``.
-    """
-    box = box_of(mask)
+def texture_view(frame: ObjectView) -> ObjectView | None:
+    """A whole frame as a texture is taken from it; None if its mask is empty or too small to have an inside."""
+    box = box_of(frame.mask)
     if box is None:
         return None
-    window = Window.around(box, _TEXTURE_MARGIN, 1)
-    window = Window(window.left, window.top, window.side, min(window.side, _LARGEST))
-    view = ObjectView.of_frame(index, image, mask, camera, T_cam_obj).at(window)
+    view = frame.at(Window.around(box, _TEXTURE_MARGIN, _LARGEST, enlarge=False))
     return view if view.interior.any() else None
 
 
-def shape_view(
-    index: int,
-    image: Image,
-    mask: NDArray[np.bool_],
-    camera: Camera,
-    T_cam_obj: NDArray[np.float64],
-    side: int = SIDE,
-) -> ObjectView | None:
-    """A frame as a shape is made from it, ``side`` pixels wide; None if its mask is empty. See `texture_view`."""
-    box = box_of(mask)
+def shape_view(frame: ObjectView, side: int = SIDE) -> ObjectView | None:
+    """A whole frame as a shape is made from it, ``side`` pixels wide; None if its mask is empty."""
+    box = box_of(frame.mask)
     if box is None:
         return None
-    view = ObjectView.of_frame(index, image, mask, camera, T_cam_obj).at(Window.around(box, _MARGIN, side))
+    view = frame.at(Window.around(box, _MARGIN, side))
     return view if view.mask.any() else None
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.scene.view import Array, Mask, ObjectView, Plane, project_points
@@ -65,6 +66,17 @@ class Drawn(ObjectView):
         near = inside & (drawn > 0) & (sample(self.beyond, xy) < 3)
         with np.errstate(invalid="ignore", divide="ignore"):
             return xy, near & (depth < 1 / drawn + tolerance)
+
+
+def camera_tensors(view: ObjectView) -> tuple[Tensor, Tensor, Tensor]:
+    """``(1, 3, 3)`` rotation, ``(1, 3)`` translation and ``(1, 3, 3)`` intrinsics of a view, float32."""
+    T = torch.from_numpy(view.T_cam_obj[None]).float()
+    return T[:, :3, :3], T[:, :3, 3], torch.from_numpy(view.K[None]).float()
+
+
+def image_tensor(view: ObjectView) -> Tensor:
+    """``(3, h, w)`` colours of a view in [0, 1]."""
+    return torch.from_numpy(view.image).permute(2, 0, 1).float() / 255
 
 
 def draw(view: ObjectView, vertices: Array, faces: NDArray[np.int64], reach: float = np.inf) -> Drawn:

@@ -63,9 +63,7 @@ def draw_around_masks(
     box = box_of(frame.initial | frame.mask)
     if box is None:
         return None
-    window = Window.around(box, _MARGIN, 1)
-    window = Window(window.left, window.top, window.side, min(window.side, LARGEST))
-    return draw(frame.at(window), vertices, faces)
+    return draw(frame.at(Window.around(box, _MARGIN, LARGEST, enlarge=False)), vertices, faces)
 
 
 @dataclass(frozen=True, eq=False)
