@@ -24,6 +24,7 @@ from tracking3d.reconstruction.run_views import shows_other_side, surface_keypoi
 from tracking3d.results.mesh_export import export_mesh, find_seen_faces, load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import scale_run, unit_scale
+from tracking3d.scene.view import ObjectView
 
 TO_OWN = Similarity(
     Rotation.from_euler("xyz", [40, -70, 20], degrees=True).as_matrix(), 1.7, np.array([0.3, -0.2, 0.5])
@@ -52,7 +53,7 @@ def frames(yaws, model, place=lambda T: T, texture=None):
     found = []
     for yaw in yaws:
         image, mask = seen(pose(yaw), pattern() if texture is None else texture)
-        found.append(surface_keypoints(image, mask, CAMERA, place(pose(yaw)), model))
+        found.append(surface_keypoints(ObjectView.of_frame(0, image, mask, CAMERA, place(pose(yaw))), model))
     return found
 
 

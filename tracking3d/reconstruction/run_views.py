@@ -14,8 +14,7 @@ from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.estimation.online.features.sift import Keypoints, detect
-from tracking3d.frames import Frame, Image, pixels
-from tracking3d.geometry.camera import Camera
+from tracking3d.frames import Frame, pixels
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
 from tracking3d.reconstruction.shape import MOST
@@ -25,7 +24,8 @@ from tracking3d.rendering.visibility import rasterize
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each
-from tracking3d.scene.view import ObjectView
+from tracking3d.scene.surface import camera_tensors
+from tracking3d.scene.view import Mask, ObjectView
 from tracking3d.trackers.crops import box_of
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource
@@ -54,43 +54,24 @@ def shows_other_side(kept: Sequence[SurfaceKeypoints], T_cam_obj: NDArray[np.flo
     return max(traces, default=-1.0) < 1 + 2 * np.cos(np.radians(_APART))
 
 
-def surface_keypoints(
-    image: Image,
-    mask: NDArray[np.bool_],
-    camera: Camera,
-    T_cam_obj: NDArray[np.float64],
-    model: ObjectModel,
-) -> SurfaceKeypoints:
-    """Detect keypoints on the object where its surface is known.
-
-    Args:
-        image: ``(H, W, 3)`` RGB.
-        mask: ``(H, W)`` what is seen of the object.
-        camera: Camera of the frame.
-        T_cam_obj: ``(4, 4)``.
-        model: The object.
-    """
-    height, width = mask.shape
-    K = camera.K
-    T = torch.from_numpy(np.asarray(T_cam_obj, np.float64)[None]).float()
-    screen, z = project(
-        torch.from_numpy(model.vertices).float(), T[:, :3, :3], T[:, :3, 3], torch.from_numpy(K[None]).float()
-    )
+def surface_keypoints(frame: ObjectView, model: ObjectModel) -> SurfaceKeypoints:
+    """Detect keypoints on the object in a whole frame, where its surface is known and its mask shows it."""
+    height, width = frame.frame_size
+    screen, z = project(torch.from_numpy(model.vertices).float(), *camera_tensors(frame))
     depth = rasterize(screen, z, torch.from_numpy(model.faces), (height, width)).depth[0].numpy()
     kernel = np.ones((2 * _MARGIN + 1,) * 2, np.uint8)
-    region = cv2.erode((mask & np.isfinite(depth)).astype(np.uint8), kernel) > 0
-    box = box_of(mask)
+    region = cv2.erode((frame.mask & np.isfinite(depth)).astype(np.uint8), kernel) > 0
+    box = box_of(frame.mask)
     length = float(max(box[2:])) if box is not None else 1.0
-    found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), region, length)
-    P = K @ np.asarray(T_cam_obj)[:3]
+    found = detect(frame.grey, region, length)
     column, row = np.rint(found.pixel).astype(int).T if len(found) else np.zeros((2, 0), int)
     there = depth[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
-    rays = np.column_stack([found.pixel, np.ones(len(found))]) @ np.linalg.inv(K).T
+    rays = np.column_stack([found.pixel, np.ones(len(found))]) @ np.linalg.inv(frame.K).T
     known = np.isfinite(there)
     camera_points = rays[known] * there[known, None]
-    points = (camera_points - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3]
+    points = (camera_points - frame.T_cam_obj[:3, 3]) @ frame.T_cam_obj[:3, :3]
     kept = Keypoints(found.pixel[known], found.descriptor[known])
-    return SurfaceKeypoints(kept, points, P, np.asarray(T_cam_obj), length)
+    return SurfaceKeypoints(kept, points, frame.P, frame.T_cam_obj, length)
 
 
 _NEXT_RUN = 10_000_000  # added to frame indices of another run, so that views of several have different ones
@@ -157,22 +138,20 @@ def collect_views(
         if len(left_out) > 2 * MOST_LEFT_OUT:
             left_out = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
         if model is not None and shows_other_side(keypoints, np.asarray(record.T_cam_obj)):
-            mask, camera = run.visible_pinhole_mask(frame.index), run.camera_of(record)
-            keypoints.append(
-                surface_keypoints(frame.image, mask, camera, np.asarray(record.T_cam_obj), model)
-            )
+            visible = _whole_view(run, frame, record, run.visible_pinhole_mask(frame.index))
+            keypoints.append(surface_keypoints(visible, model))
     return RunViews(shapes, spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT), textures, keypoints)
 
 
 def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ObjectView, ObjectView] | None:
     """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
-    pose = run.camera_of(record), np.asarray(record.T_cam_obj)
-    whole, visible = (
-        ObjectView.of_frame(frame.index, frame.image, mask, *pose)
-        for mask in (run.pinhole_mask(frame.index), run.visible_pinhole_mask(frame.index))
-    )
-    shape, view = shape_view(whole), texture_view(visible)
+    shape = shape_view(_whole_view(run, frame, record, run.pinhole_mask(frame.index)))
+    view = texture_view(_whole_view(run, frame, record, run.visible_pinhole_mask(frame.index)))
     return None if shape is None or view is None else (shape, view)
+
+
+def _whole_view(run: RunReader, frame: Frame, record: FrameRecord, mask: Mask) -> ObjectView:
+    return ObjectView.of_frame(frame.index, frame.image, mask, run.camera_of(record), record.T_cam_obj)
 
 
 def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterator[tuple[Frame, FrameRecord]]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
-from tracking3d.scene.view import FrameCrop, crop_window, inside_frame
+from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
 from tracking3d.trackers.confidence import Judgement, outline_margin
@@ -327,18 +327,18 @@ def find_by_colours(
     left, top = ((at + 0.5) / scale - side / 2 for at in (column, row))
     window = Window.around((left, top, side, side), margin, size)
 
-    crop, in_frame = crop_window(image, window), inside_frame(image.shape, window)
+    crop = FrameCrop.of(image, window)
     rows, columns = np.mgrid[:size, :size] + 0.5 - size / 2
-    evidence = 2 * colours.rarity(lab(crop), overview) + 1 - np.hypot(rows, columns) / (0.3 * size)
+    evidence = 2 * colours.rarity(crop.lab, overview) + 1 - np.hypot(rows, columns) / (0.3 * size)
     evidence -= _UNCHANGED * crop_window(known, window)
     support = np.tanh(evidence / 3).astype(np.float32)
-    smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop, support, 100.0, 12.0)
-    found = (smooth > 0) & in_frame
+    smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop.image, support, 100.0, 12.0)
+    found = (smooth > 0) & crop.in_frame
     mask = _largest(remove_specks(found, found))
     if not _LEAST_AREA * area <= np.count_nonzero(mask) / window.scale**2 <= _MOST_AREA * area:
         return None
     inside, around = both_sides(mask)
-    return mask, window, colours.separation(lab(crop), inside, around & in_frame)
+    return mask, window, colours.separation(crop.lab, inside, around & crop.in_frame)
 
 
 def _largest(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

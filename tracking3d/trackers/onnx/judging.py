@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
-from tracking3d.scene.view import crop_window, inside_frame
+from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.confidence import Judgement, inside_distance, outline_margin
 from tracking3d.trackers.crops import box_iou, box_of
@@ -62,8 +62,8 @@ class ColourJudge:
     """
 
     def __init__(self, image: Image, mask: NDArray[np.float32]) -> None:
-        window = _window(box_of(mask) or (0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])))
-        self._colours = GlobalColours(lab(crop_window(image, window)), *_sides(mask, window))
+        crop = _crop(image, box_of(mask) or (0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])))
+        self._colours = GlobalColours(crop.lab, *_sides(mask, crop))
 
     def verdict(self, image: Image, proposal: Proposal, tracked_box: Box | None) -> Verdict:
         """Sharpen a proposal by the colours and judge it.
@@ -79,8 +79,8 @@ class ColourJudge:
     def learn(self, image: Image, mask: NDArray[np.float32]) -> None:
         """Let the colours follow a mask that is trusted."""
         if (box := box_of(mask)) is not None:
-            window = _window(box)
-            self._colours.update(lab(crop_window(image, window)), *_sides(mask, window))
+            crop = _crop(image, box)
+            self._colours.update(crop.lab, *_sides(mask, crop))
 
     def corrected(self, image: Image, mask: NDArray[np.float32]) -> ColourJudge:
         """This judge after a correction; a new one if the mask shows that its colours were wrong."""
@@ -93,10 +93,10 @@ class ColourJudge:
         box = box_of(mask)
         if box is None:
             return Judgement(0.0, 0.0, 0.0, believed=False)
-        window = _window(box)
-        colours = lab(crop_window(image, window))
-        separation = self._colours.separation(colours, *_sides(mask, window))
-        margin = outline_margin(self._colours.log_ratio(colours), crop_window(mask, window) > 0.5)
+        crop = _crop(image, box)
+        inside, around = _sides(mask, crop)
+        separation = self._colours.separation(crop.lab, inside, around)
+        margin = outline_margin(self._colours.log_ratio(crop.lab), inside)
         return Judgement(separation, margin, None if tracked_box is None else box_iou(box, tracked_box))
 
     def _sharpen(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -129,8 +129,8 @@ def background_points(image: Image, mask: NDArray[np.float32], most: int = 3) ->
     box = box_of(mask)
     if box is None:
         return np.zeros((0, 2), np.float32)
-    window = _window(box)
-    colours = GlobalColours(lab(crop_window(image, window)), *_sides(mask, window))
+    crop = _crop(image, box)
+    colours = GlobalColours(crop.lab, *_sides(mask, crop))
     rows, columns = enlarge(box, 1.0, image.shape)
     inside = mask[rows, columns] > 0.5
     log_odds = _smooth(colours.log_ratio(lab(image[rows, columns])), 0.67 * _RADIUS, mask)
@@ -148,8 +148,8 @@ def background_points(image: Image, mask: NDArray[np.float32], most: int = 3) ->
     return np.asarray(points, np.float32).reshape(-1, 2)
 
 
-def _window(box: Box) -> Window:
-    return Window.around(box, _MARGIN, _SIZE)
+def _crop(image: Image, box: Box) -> FrameCrop:
+    return FrameCrop.of(image, Window.around(box, _MARGIN, _SIZE))
 
 
 def _smooth(values: NDArray[np.float32], radius: float, mask: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -158,11 +158,10 @@ def _smooth(values: NDArray[np.float32], radius: float, mask: NDArray[np.float32
     return cv2.blur(values, (2 * reach + 1, 2 * reach + 1))
 
 
-def _sides(mask: NDArray[np.float32], window: Window) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The object's pixels in a window, and those of the frame surely beyond its outline."""
-    inside = crop_window(mask, window) > 0.5
-    in_frame = inside_frame(mask.shape, window)
+def _sides(mask: NDArray[np.float32], crop: FrameCrop) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The object's pixels in a crop, and those of the frame surely beyond its outline."""
+    inside = crop_window(mask, crop.window) > 0.5
     if not inside.any():
-        return inside, in_frame
+        return inside, crop.in_frame
     beyond = inside_distance(inside) < -_BAND * math.sqrt(np.count_nonzero(inside))
-    return inside, beyond & in_frame
+    return inside, beyond & crop.in_frame
