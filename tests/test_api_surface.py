@@ -69,7 +69,7 @@ AT_LEAST = {
     "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
     "tracking3d.video.in_memory": "open_frames",
     "tracking3d.pipeline.track": "Session track track_objects",
-    "tracking3d.points.online": "PointAnswers",
+    "tracking3d.points.answers": "PointAnswers",
     "tracking3d.networks.download": "adopt fetch",
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",

@@ -10,7 +10,7 @@ import trimesh
 
 from tracking3d.errors import InputError
 from tracking3d.geometry import mesh
-from tracking3d.geometry.mesh import what_is_wrong
+from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.geometry.prototypes import from_file
 from tracking3d_bench.datasets.truth import MeshFile
 from tracking3d_bench.synthesis.mesh_files import load_solid
