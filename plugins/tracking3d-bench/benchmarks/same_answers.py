@@ -151,7 +151,17 @@ class Sequence:
         shape = ",".join(map(str, box))
         count = len(list((clip / "frames").iterdir())) if frames is None else frames
         tracker = "segment" if self.way == "segment" else "csrt"
-        run = ["run", clip / "frames", "--box", shape, "--out", folder, "--quiet", "--frames", f"0:{count}"]
+        run: list[str | Path] = [
+            "run",
+            clip / "frames",
+            "--box",
+            shape,
+            "--out",
+            folder,
+            "--quiet",
+            "--frames",
+            f"0:{count}",
+        ]
         run += ["--tracker", tracker, "--features", "rgb"]
         if self.way == "split":
             version.command(*run, "--fps", "10", "--split", str(count / 20), "--workers", "1")
