@@ -44,4 +44,4 @@ def test_an_unreleased_entry_of_the_changelog_takes_at_most_three_lines():
     entries = re.findall(r"^- .*(?:\n .*)*", unreleased, re.MULTILINE)
     assert [entry for entry in entries if entry.count("\n") > 2] == []
     assert [line for line in unreleased.splitlines() if len(line) > 120] == []
-    assert re.findall(r"^[^-# ].*", unreleased, re.MULTILINE) == []
+    assert re.findall(r"^[^-# \n].*", unreleased, re.MULTILINE) == []
