@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.geometry.camera import NEAR, Camera, Window
+from tracking3d.geometry.camera import Camera, Window
 from tracking3d.scene.surface import Drawn, draw
 from tracking3d.scene.view import Array, FrameCrop, ObjectView, crop_window, project_points
 
@@ -43,8 +43,8 @@ def cut_window(
     Returns:
         The window, or None if the pose is no number or nothing of the object lies in the frame.
     """
-    xy, depth = project_points(vertices, camera.K, T_cam_obj)
-    if not (depth > NEAR).all():
+    xy, _ = project_points(vertices, camera.K, T_cam_obj)
+    if not np.isfinite(xy).all():
         return None
     size = np.array([camera.width, camera.height])
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
@@ -58,8 +58,10 @@ def cut_window(
     factor = min(1.0, longest_side / max(across, down))
     width, height = (max(round(side * factor), 8) for side in (across, down))
     window = Window(left, top, across, width, (down, height))
-    grey = crop_window(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), window)
-    return FrameCrop(window, grey, mask.shape, crop_window(mask.astype(np.uint8) * np.uint8(255), window))
+    region, here = (slice(top, top + down), slice(left, left + across)), replace(window, left=0, top=0)
+    grey = crop_window(cv2.cvtColor(image[region], cv2.COLOR_RGB2GRAY), here)
+    inside = crop_window(mask[region].astype(np.uint8) * np.uint8(255), here)
+    return FrameCrop(window, grey, mask.shape, inside)
 
 
 def draw_into_window(

@@ -57,7 +57,7 @@ class Drawn(ObjectView):
             ``(N, 2)`` pixels and ``(N,)`` bool.
         """
         xy, depth = self.project(points)
-        height, width = self.image.shape
+        height, width = self.window.shape
         with np.errstate(invalid="ignore"):
             inside = ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(1)
         # The deepest around: on a steep surface a pixel aside is much nearer or further.
