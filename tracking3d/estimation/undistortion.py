@@ -15,15 +15,10 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
 from tracking3d.estimation.solver import (
-    ContinuingSolver,
-    ExtendingSolver,
     Gap,
-    GuidedSolver,
-    LiveSolver,
     ModelCoverage,
     PhotoEstimates,
     PhotoSet,
-    PhotoSolver,
     RefinedStart,
     RefiningSolver,
     Solver,
@@ -37,7 +32,7 @@ def undistort_solver(lens: Lens | None, solver: Solver[Any]) -> Solver[Any]:
     """The solver behind a lens; the solver itself if there is no distortion."""
     if lens is None:
         return solver
-    complete = isinstance(solver, RefiningSolver) and isinstance(solver, GuidedSolver)
+    complete = isinstance(solver, RefiningSolver)
     return (CompleteUndistortingSolver if complete else UndistortingSolver)(lens, solver)
 
 
@@ -56,18 +51,6 @@ class UndistortingSolver(Generic[State]):
         """See `Solver.step`."""
         state, estimate = self._solver.step(state, self._frame(frame), self._mask(mask))
         return state, self._answer(estimate, mask)
-
-    def for_live_source(self) -> Self:
-        """See `LiveSolver.for_live_source`."""
-        live = isinstance(self._solver, LiveSolver)
-        return type(self)(self._lens, self._solver.for_live_source()) if live else self
-
-    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
-        """See `LiveSolver.finish_background_work`."""
-        if not isinstance(self._solver, LiveSolver):
-            return state, None
-        state, found = self._solver.finish_background_work(state)
-        return state, None if found is None else self._answer(found)
 
     def result(self, state: State) -> ObjectModel:
         """See `Solver.result`."""
@@ -105,7 +88,7 @@ class UndistortingSolver(Generic[State]):
 
 
 class CompleteUndistortingSolver(UndistortingSolver[State]):
-    """Of a solver that refines and can be steered, too; see `RefiningSolver` and `GuidedSolver`."""
+    """Of a solver that refines and can be steered, too; see `RefiningSolver`."""
 
     def refine(self, state: State) -> State:
         """See `RefiningSolver.refine`."""
@@ -120,33 +103,29 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         return state, self._answer(estimate, mask)
 
     def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
-        """See `ContinuingSolver.continue_refinement`."""
-        if not isinstance(self._solver, ContinuingSolver):
-            return None
+        """See `RefiningSolver.continue_refinement`."""
         continued: State | None = self._solver.continue_refinement(state, start)
         return continued
 
     def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
-        """See `ContinuingSolver.keep_frame`."""
+        """See `RefiningSolver.keep_frame`."""
         kept: State = self._solver.keep_frame(state, self._frame(frame), T_cam_obj)
         return kept
 
     def keyframe_poses(self, state: State) -> Mapping[int, NDArray[np.float64]]:
-        """See `ContinuingSolver.keyframe_poses`."""
-        continuing = isinstance(self._solver, ContinuingSolver)
-        return self._solver.keyframe_poses(state) if continuing else {}
+        """See `RefiningSolver.keyframe_poses`."""
+        poses: Mapping[int, NDArray[np.float64]] = self._solver.keyframe_poses(state)
+        return poses
 
     def begin_extension(
         self, state: State, confidence: Mapping[int, float]
     ) -> tuple[State, ModelCoverage] | None:
-        """See `ExtendingSolver.begin_extension`."""
-        if not isinstance(self._solver, ExtendingSolver):
-            return None
+        """See `RefiningSolver.begin_extension`."""
         begun: tuple[State, ModelCoverage] | None = self._solver.begin_extension(state, confidence)
         return begun
 
     def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
-        """See `ExtendingSolver.extend`; the estimates' masks are those of the pinhole camera."""
+        """See `RefiningSolver.extend`; the estimates' masks are those of the pinhole camera."""
         frames = ((self._frame(frame), self._mask(mask)) for frame, mask in gap.frames)
         extended: tuple[State, list[FrameEstimate]] = self._solver.extend(
             state, replace(gap, anchor=self._frame(gap.anchor), frames=frames)
@@ -154,24 +133,22 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
         return extended
 
     def end_extension(self, state: State, found: Collection[int], last: int) -> State:
-        """See `ExtendingSolver.end_extension`."""
+        """See `RefiningSolver.end_extension`."""
         ended: State = self._solver.end_extension(state, found, last)
         return ended
 
     def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
-        """See `ExtendingSolver.start_from`; poses are those of the pinhole camera in any case."""
-        return (
-            state if not isinstance(self._solver, ExtendingSolver) else self._solver.start_from(state, poses)
-        )
+        """See `RefiningSolver.start_from`; poses are those of the pinhole camera in any case."""
+        started: State = self._solver.start_from(state, poses)
+        return started
 
     def has_points(self, state: State, ended: bool) -> bool:
-        """See `PhotoSolver.has_points`."""
-        return not isinstance(self._solver, PhotoSolver) or self._solver.has_points(state, ended)
+        """See `RefiningSolver.has_points`."""
+        known: bool = self._solver.has_points(state, ended)
+        return known
 
     def start_from_photos(self, state: State, photos: PhotoSet) -> tuple[State, PhotoEstimates]:
-        """See `PhotoSolver.start_from_photos`; the estimates' masks are those of the pinhole camera."""
-        if not isinstance(self._solver, PhotoSolver):
-            return state, PhotoEstimates((), "")
+        """See `RefiningSolver.start_from_photos`; the estimates' masks are those of the pinhole camera."""
 
         def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
             return ((self._frame(frame), self._mask(mask)) for frame, mask in photos.read(indices))
@@ -184,12 +161,21 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> State:
-        """See `GuidedSolver.restart_backwards`."""
+        """See `RefiningSolver.restart_backwards`."""
         turned: State = self._solver.restart_backwards(state, self._frame(frame), number, T_cam_obj)
         return turned
 
     def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
-        """See `GuidedSolver.trust_mask`."""
+        """See `RefiningSolver.trust_mask`."""
         seen = self._lens.mask_to_pinhole(mask)
         trusted: State = self._solver.trust_mask(state, self._frame(frame), seen)
         return trusted
+
+    def for_live_source(self) -> Self:
+        """See `RefiningSolver.for_live_source`."""
+        return type(self)(self._lens, self._solver.for_live_source())
+
+    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
+        """See `RefiningSolver.finish_background_work`."""
+        state, found = self._solver.finish_background_work(state)
+        return state, None if found is None else self._answer(found)

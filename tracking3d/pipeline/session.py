@@ -21,7 +21,7 @@ from tracking3d.estimation.estimate import (
     mark_failed,
     with_initial_mask,
 )
-from tracking3d.estimation.solver import GuidedSolver, LiveSolver, Solver
+from tracking3d.estimation.solver import RefiningSolver, Solver
 from tracking3d.estimation.undistortion import undistort_solver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
@@ -171,7 +171,7 @@ class Session(SessionRefinement):
         self._first, self._presented, self._latest = first, FrameOrder(first.index), first.index
         solver = build_solver(self.config, self._camera, self._encoder, self._known)
         solver = undistort_solver(self._camera.lens, solver)
-        return solver.for_live_source() if self._live and isinstance(solver, LiveSolver) else solver
+        return solver.for_live_source() if self._live and isinstance(solver, RefiningSolver) else solver
 
     @property
     def state_classes(self) -> tuple[type, ...]:
@@ -204,7 +204,7 @@ class Session(SessionRefinement):
         return late
 
     def _finish_background_work(self) -> list[FrameEstimate]:
-        if not (self._live and isinstance(self._solver, LiveSolver)):
+        if not (self._live and isinstance(self._solver, RefiningSolver)):
             return []
         with self._settings.in_force():
             self._state, found = self._solver.finish_background_work(self._state)
@@ -288,7 +288,7 @@ class Session(SessionRefinement):
         self.initial_mask = mask
         try:
             shown = self._presented.number(frame)
-            if prompt is not None and mask.found is not None and isinstance(solver, GuidedSolver):
+            if prompt is not None and mask.found is not None and isinstance(solver, RefiningSolver):
                 self._state = solver.trust_mask(self._state, shown, mask.found)
             self._state, estimate = solver.step(self._state, shown, mask)
             estimate = replace(self._presented.index(estimate), occluder=mask.occluder)
@@ -326,7 +326,7 @@ class Session(SessionRefinement):
                 self._latest = frame.index
             else:
                 check_backward_tracking(self.config)
-                assert isinstance(solver, GuidedSolver)
+                assert isinstance(solver, RefiningSolver)
                 self._presented = FrameOrder(first.index, self._latest)
                 self._state = solver.restart_backwards(self._state, first, self._latest, self._first_pose)
         return solver

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask
 from tracking3d.estimation.solver import (
-    ContinuingSolver,
-    ExtendingSolver,
     Gap,
-    GuidedSolver,
     ModelCoverage,
     PhotoSet,
-    PhotoSolver,
     RefinedStart,
     RefiningSolver,
     Solver,
@@ -71,7 +67,7 @@ class SessionRefinement:
             RuntimeError: If the solver cannot, see ``can_refine``.
         """
         with self._settings.in_force(), measure("map") as watch:
-            self._state = self._refining().refine(self._state)
+            self._state = self._refining.refine(self._state)
         self.refining += watch.times
         self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
@@ -82,11 +78,10 @@ class SessionRefinement:
         Args:
             confidence: Of the causal estimate of each frame, by index.
         """
-        solver = self._solver
-        if not isinstance(solver, ExtendingSolver) or not self.order_of_time:
+        if not self.can_refine or not self.order_of_time:
             return None
         with self._settings.in_force():
-            begun = solver.begin_extension(self._state, confidence)
+            begun = self._refining.begin_extension(self._state, confidence)
         if begun is None:
             return None
         self._state, explained = begun
@@ -94,10 +89,9 @@ class SessionRefinement:
 
     def extend(self, gap: Gap) -> list[FrameEstimate]:
         """Track the object through a gap, before `refine`; no estimates if a plug-in fails."""
-        assert isinstance(self._solver, ExtendingSolver)
         try:
             with self._settings.in_force(), measure("map") as watch:
-                self._state, estimates = self._solver.extend(self._state, gap)
+                self._state, estimates = self._refining.extend(self._state, gap)
         except PluginFailure:
             return []
         self.refining += watch.times
@@ -105,9 +99,8 @@ class SessionRefinement:
 
     def end_extension(self, poses: Mapping[int, NDArray[np.float64]], last: int) -> None:
         """Refine the frames of gaps from these poses ``(4, 4)``, by index; ``last`` is the last frame of the video."""
-        assert isinstance(self._solver, ExtendingSolver)
-        self._state = self._solver.end_extension(self._state, set(poses), last)
-        self._state = self._solver.start_from(self._state, poses)
+        self._state = self._refining.end_extension(self._state, set(poses), last)
+        self._state = self._refining.start_from(self._state, poses)
 
     @property
     def first_index(self) -> int:
@@ -130,7 +123,7 @@ class SessionRefinement:
             What it comes to; None if the solver cannot, or a plug-in fails.
         """
         solver, state, first, found = self._solver, None, None, dict[int, FrameEstimate]()
-        if not isinstance(solver, GuidedSolver):
+        if not isinstance(solver, RefiningSolver):
             return None
         order, latest = FrameOrder(0), 0
         try:
@@ -156,25 +149,23 @@ class SessionRefinement:
         return Attempt(state, order, poses, confidence)
 
     def lacks_points(self, ended: bool) -> bool:
-        """Whether there is no map with points, and the solver could start from photos; see `PhotoSolver`."""
-        solver = self._solver
-        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+        """Whether there is no map with points, and the solver could start from photos."""
+        if not self.can_refine:
             return False
         with self._settings.in_force():
-            return not solver.has_points(self._state, ended)
+            return not self._refining.has_points(self._state, ended)
 
     def start_from_photos(self, photos: PhotoSet) -> tuple[Attempt | None, str]:
-        """Join the frames as photos, in whatever order; see `PhotoSolver`.
+        """Join the frames as photos, in whatever order; see `RefiningSolver.start_from_photos`.
 
         Returns:
             What it comes to, None if nothing does; and which photos are not joined, in words.
         """
-        solver = self._solver
-        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+        if not self.can_refine:
             return None, ""
         try:
             with self._settings.in_force(), measure("map") as watch:
-                state, made = solver.start_from_photos(self._state, photos)
+                state, made = self._refining.start_from_photos(self._state, photos)
         except PluginFailure:
             return None, ""
         self.refining += watch.times
@@ -188,9 +179,8 @@ class SessionRefinement:
     def adopt(self, attempt: Attempt) -> None:
         """Continue with another start in place of the first one."""
         self._state, order = attempt.state, attempt.order
-        if isinstance(self._solver, ExtendingSolver):
-            poses = {order.number_of(index): T for index, T in attempt.poses.items()}
-            self._state = self._solver.start_from(self._state, poses)
+        poses = {order.number_of(index): T for index, T in attempt.poses.items()}
+        self._state = self._refining.start_from(self._state, poses)
         self._presented = order
         self._camera = getattr(self._state, "camera", self._camera)
 
@@ -203,27 +193,23 @@ class SessionRefinement:
         Returns:
             Whether that is possible; if not, nothing has changed.
         """
-        solver = self._solver
-        if not isinstance(solver, ContinuingSolver) or self._presented.last is not None:
+        if not self.can_refine or not self.order_of_time:
             return False
         with self._settings.in_force(), measure("map") as watch:
-            state = solver.continue_refinement(self._state, start)
+            state = self._refining.continue_refinement(self._state, start)
         if state is None:
             return False
         self.refining, self._state, self._camera, self._refined = watch.times, state, start.camera, True
         return True
 
     def keyframe_poses(self) -> Mapping[int, NDArray[np.float64]]:
-        """Refined poses ``(4, 4)`` of keyframes after `refine`, see `ContinuingSolver.keyframe_poses`."""
-        if not isinstance(self._solver, ContinuingSolver) or self._presented.last is not None:
-            return {}
-        return self._solver.keyframe_poses(self._state)
+        """Refined poses ``(4, 4)`` of keyframes after `refine`, see `RefiningSolver.keyframe_poses`."""
+        return self._refining.keyframe_poses(self._state) if self.can_refine and self.order_of_time else {}
 
     def keep_frame(self, frame: Frame, T_cam_obj: NDArray[np.float64]) -> None:
         """Take a frame whose refined pose ``(4, 4)`` stands, before the next one is refined."""
-        if isinstance(self._solver, ContinuingSolver):
-            with self._settings.in_force():
-                self._state = self._solver.keep_frame(self._state, frame, T_cam_obj)
+        with self._settings.in_force():
+            self._state = self._refining.keep_frame(self._state, frame, T_cam_obj)
 
     @contextmanager
     def state_unchanged(self) -> Iterator[None]:
@@ -246,7 +232,7 @@ class SessionRefinement:
             PluginError: If a plug-in fails; the causal estimate then stands, and the next frame may be asked for.
             RuntimeError: Before ``refine``.
         """
-        solver = self._refining()
+        solver = self._refining
         if not self._refined:
             raise RuntimeError("frames are revisited after refine")
         try:
@@ -263,6 +249,7 @@ class SessionRefinement:
             estimate = mark_failed(estimate, failure)
         return add_times(estimate, watch, frame)
 
+    @property
     def _refining(self) -> RefiningSolver[Any]:
         if not isinstance(self._solver, RefiningSolver):
             raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")

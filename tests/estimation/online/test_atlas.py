@@ -13,7 +13,7 @@ from online_runs import estimate_of, final
 from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
-from tracking3d.estimation.online.atlas.atlas import (
+from tracking3d.estimation.online.atlas import (
     activate_largest_map,
     colours_match,
     guess_alignment,

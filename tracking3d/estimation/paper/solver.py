@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.config.models import KeyframeConfig, PaperConfig
+from tracking3d.config.models import KeyframeConfig, PaperConfig, PipelineConfig
 from tracking3d.estimation.estimate import Assessment, FrameEstimate, MaskSource, ObjectModel, Status, assess
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.observation import Observation, ObservationBatch, downsample
+from tracking3d.estimation.observation import Observation, ObservationBatch, Observer, downsample
 from tracking3d.estimation.paper.problem import Optimum, Parameters, Problem, optimize
 from tracking3d.estimation.paper.state import PaperState, PosedObservation
 from tracking3d.estimation.shape import (
@@ -33,8 +33,9 @@ from tracking3d.estimation.shape import (
     visible_texture,
 )
 from tracking3d.estimation.solver import STATE_CLASSES
-from tracking3d.estimation.solver_base import SolverBase
+from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_angle, rotation_exponential
 from tracking3d.rendering import BackProjection, TexelMap
 from tracking3d.rendering.visibility import NEAR
@@ -42,11 +43,19 @@ from tracking3d.runtime.stage_times import in_stage
 
 
 @dataclass(frozen=True)
-class PaperSolver(SolverBase):
+class PaperSolver:
     """See the module; implements `tracking3d.estimation.solver.Solver`."""
+
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame
+    encoder: FeatureEncoder  # the feature encoder
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, PaperState, PosedObservation)
     """What a `PaperState` is made of, for keeping it."""
+
+    @property
+    def _observer(self) -> Observer:
+        return Observer(self.config, self.camera, self.encoder)
 
     @property
     def settings(self) -> PaperConfig:
@@ -73,10 +82,10 @@ class PaperSolver(SolverBase):
         binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
-        pose = Pose.identity(translation.to(self.device))
+        pose = Pose.identity(translation.to(self._observer.device))
         prototype = prototype_mesh(self.config.object, ellipse)
-        shape = Shape.of(prototype, self.config.object.flat, self.device)
-        size = self.config.object.texture_size
+        shape = Shape.of(prototype, self.config.object.flat, self._observer.device)
+        size, device = self.config.object.texture_size, self._observer.device
         offsets = torch.zeros_like(shape.rest)
         if shape.flat:
             # Facing the camera: any plane fits a ball, and the one that fits an ellipsoid best is seen edge-on.
@@ -86,10 +95,11 @@ class PaperSolver(SolverBase):
             shape,
             TexelMap.of(shape.face_uvs, size),
             offsets,
-            torch.zeros(self._channels, size, size, device=self.device),
+            torch.zeros(self._channels, size, size, device=device),
             (),
             BackProjection(
-                torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
+                torch.zeros(3, size, size, device=device),
+                torch.zeros(size, size, device=device),
             ),
             (pose, frame.index),
             waiting=() if self.settings.init_frames > 1 else None,
@@ -129,7 +139,7 @@ class PaperSolver(SolverBase):
     def _observe(
         self, state: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        return self.observe(frame, mask, pose, state.vertices, state.camera, state.space)
+        return self._observer.observe(frame, mask, pose, state.vertices, state.camera, state.space)
 
     def _best_candidate(self, state: PaperState, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import RELOCALIZED, FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
@@ -20,27 +23,24 @@ from tracking3d.estimation.observation import mask_box
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
 from tracking3d.estimation.online.known_object.rendered_keyframes import map_of_known_object, sides
-from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe
+from tracking3d.estimation.online.mapper import insert_frame
+from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
 from tracking3d.estimation.online.mapping.local_mapping import nearest_views, project_points
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.relocalization.pose_search import (
+from tracking3d.estimation.online.relocalization import (
     overlaps_mask,
     poses_from_matches,
     should_retry,
 )
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose
+from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.online.tracking.pose_tracking import (
-    candidate_cost,
-    find_inliers,
-    pose_evidence,
-    pose_of_points,
-)
-from tracking3d.estimation.online.user_guidance import restart_backwards
+from tracking3d.estimation.online.tracking.pose_tracking import candidate_cost, pose_of_points
+from tracking3d.estimation.solver import RefiningSolver
+from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix
@@ -55,14 +55,22 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class KnownObjectSolver(OnlineSolver):
+class KnownObjectSolver(RefiningSolver[SolverState]):
     """Tracks a known object; estimates are in the object's own coordinates and unit.
 
     Until the object is detected, frames are estimated as lost, and each is searched. From then on it is the online
     solver, on a map whose shape is fixed.
     """
 
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame
+    encoder: FeatureEncoder  # the feature encoder
     known_object: KnownObject  # the object
+
+    @cached_property
+    def online(self) -> OnlineSolver:
+        """The solver that tracks the object once it is detected."""
+        return OnlineSolver(self.config, self.camera, self.encoder)
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take the first frame.
@@ -77,8 +85,9 @@ class KnownObjectSolver(OnlineSolver):
                 f"{argument('box=', '--box X,Y,W,H')} or {argument('mask=', '--mask FILE')}."
             )
         self._warn_of_lens()
+        device = self.online.observer.device
         with in_stage("map"):
-            object_map, space = map_of_known_object(known_object, self.config, self.encoder, self.device)
+            object_map, space = map_of_known_object(known_object, self.config, self.encoder, device)
         pose = Pose.identity(
             object_map.vertices.new_tensor([0.0, 0.0, 4 * self.camera.fy / self.camera.height])
         )
@@ -86,16 +95,20 @@ class KnownObjectSolver(OnlineSolver):
             self.camera, object_map, object_map.surface(), (pose, frame.index), None, grey(frame.image),
             FollowedPoints.none(), None, space,
         )  # fmt: skip
-        state, estimate = self._sought(state, frame, binary)
+        state, estimate = self._detect(state, frame, binary)
         return state, known_object.answered(estimate)
 
     def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
         if state.trajectory:
-            state, estimate = super().step(state, frame, mask)
+            state, estimate = self.online.step(state, frame, mask)
         else:
-            state, estimate = self._sought(state, frame, mask.found)
+            state, estimate = self._detect(state, frame, mask.found)
         return state, self.known_object.answered(estimate)
+
+    def refine(self, state: SolverState) -> SolverState:
+        """See `OnlineSolver.refine`."""
+        return self.online.refine(state)
 
     def refine_frame(
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
@@ -105,15 +118,23 @@ class KnownObjectSolver(OnlineSolver):
             estimate = _unseen(initial_estimate(frame, mask.found, state.last_pose[0], state.camera))
             return state, self.known_object.answered(replace(estimate, refined=True))
         causal = self.known_object.to_solver(T_cam_obj)
-        state, estimate = super().refine_frame(state, frame, mask, causal)
+        state, estimate = self.online.refine_frame(state, frame, mask, causal)
         return state, self.known_object.answered(estimate)
+
+    def start_from(self, state: SolverState, poses: Mapping[int, NDArray[np.float64]]) -> SolverState:
+        """See `OnlineSolver.start_from`."""
+        return self.online.start_from(state, {at: self.known_object.to_solver(T) for at, T in poses.items()})
 
     def restart_backwards(
         self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> SolverState:
-        """The state that continues from an earlier frame; see `user_guidance.restart_backwards`."""
-        turned = restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
+        """The state that continues from an earlier frame; see `OnlineSolver.restart_backwards`."""
+        turned = self.online.restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
         return turned if state.trajectory else replace(turned, trajectory=())
+
+    def trust_mask(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> SolverState:
+        """See `OnlineSolver.trust_mask`."""
+        return self.online.trust_mask(state, frame, mask)
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object as it is known."""
@@ -121,7 +142,7 @@ class KnownObjectSolver(OnlineSolver):
         features = state.surface.texture.permute(1, 2, 0).cpu().numpy()
         return replace(self.known_object.model, features=features)
 
-    def _sought(
+    def _detect(
         self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None
     ) -> tuple[SolverState, FrameEstimate]:
         """Search for the object in a frame, and initialize with it if it is found."""
@@ -146,12 +167,7 @@ class KnownObjectSolver(OnlineSolver):
         if not found.doubtful or not self.known_object.has_colours:
             view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):
-                object_map, followed = insert_keyframe(
-                    state.object_map, state.camera, view, image, self.online
-                )
-                begun = replace(
-                    begun, object_map=object_map, surface=object_map.surface(), tracked_points=followed
-                )
+                begun = insert_frame(begun, view, image, self.online.options)
             estimate = replace(estimate, keyframe=True)
         return learn_colours(begun, estimate, found), estimate
 
@@ -159,7 +175,7 @@ class KnownObjectSolver(OnlineSolver):
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
         """The object in a frame without any prior; None if no keypoints match."""
-        attempts: list[PoseCandidate] = []
+        attempts, weights = list[PoseCandidate](), self.online.tracker.weights
         for region in (mask, None) if mask is not None else (None,):
             if self.known_object.has_colours and not _is_sure(attempts):
                 attempts += [
@@ -168,15 +184,16 @@ class KnownObjectSolver(OnlineSolver):
                 ]
         if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):
             assert state.surface is not None
-            view = self._view(state, frame, mask, state.last_pose[0], FollowedPoints.none())
+            nothing, last = FollowedPoints.none(), state.last_pose[0]
+            view = view_frame(self.online.observer, state, frame, mask, last, nothing)
             attempts += [
-                self._attempt(state, frame, mask, _OUTLINED, pose, FollowedPoints.none())
-                for pose in by_outline(state.surface, state.camera, view, self.weights)
+                self._attempt(state, frame, mask, _OUTLINED, pose, nothing)
+                for pose in by_outline(state.surface, state.camera, view, weights)
             ]
         believed = [one for one in attempts if not one.lost] or attempts
         return min(
             believed,
-            key=lambda one: candidate_cost(one.fit, self.weights, one.view.mask_weight, one.evidence.inliers),
+            key=lambda one: candidate_cost(one.fit, weights, one.view.mask_weight, one.evidence.inliers),
             default=None,
         )
 
@@ -190,21 +207,18 @@ class KnownObjectSolver(OnlineSolver):
         points: FollowedPoints,
     ) -> PoseCandidate:
         """The pose candidate from a pose that was found in some way."""
-        object_map, camera = state.object_map, state.camera
-        if mask is not None and not overlaps_mask(object_map.silhouette(pose, camera), mask):
+        if mask is not None and not overlaps_mask(state.object_map.silhouette(pose, state.camera), mask):
             mask = None
-        view = self._view(state, frame, mask, pose, points)
-        _, fit = self._fit(state, view, {origin: pose}, points)
-        kept = find_inliers(object_map, camera, fit.pose, points, view)
-        support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        assessment = assess_pose(fit, state.baseline, support, guessed=origin == _OUTLINED)
-        return PoseCandidate(view, fit, origin, kept, support, assessment)
+        view = view_frame(self.online.observer, state, frame, mask, pose, points)
+        return self.online.tracker.attempt(state, view, origin, guessed=origin == _OUTLINED)
 
     def _with_space(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None) -> SolverState:
         """The state with the features of an object whose colours only the first frame with a mask determines."""
         if state.feature_space is not None or mask is None or not mask.any():
             return state
-        seen = self._observe(state, frame, mask, state.last_pose[0])
+        seen = self.online.observer.observe(
+            frame, mask, state.last_pose[0], state.object_map.vertices, state.camera, None
+        )
         channels = feature_channels(self.encoder, self.config.object.texture_channels)
         return replace(state, feature_space=FeatureSpace.of(seen.features, seen.mask, channels))
 

@@ -9,14 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.features.sift import detect
 from tracking3d.estimation.online.mapping.candidate_landmarks import promote_candidates, with_candidates
-from tracking3d.estimation.online.mapping.local_mapping import refine_map, window_of, with_landmarks
+from tracking3d.estimation.online.mapping.local_mapping import (
+    mask_weight,
+    refine_map,
+    window_of,
+    with_landmarks,
+)
 from tracking3d.estimation.online.mapping.photometric_adjustment import refine_without_points
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, rotation_angle
 from tracking3d.points.landmark_adjustment import LandmarkScene
@@ -26,6 +34,32 @@ _FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake
 _MIN_INTERVAL = 3  # frames between two such keyframes
 _MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
 _MAX_KEYFRAMES_WITHOUT_POINTS = 15
+
+
+def view_frame(
+    observer: Observer,
+    state: SolverState,
+    frame: Frame,
+    mask: NDArray[np.bool_] | None,
+    pose: Pose,
+    followed: FollowedPoints,
+) -> Keyframe:
+    """A frame seen from a pose, with the mask weight that follows from the points.
+
+    Args:
+        observer: How it becomes an observation.
+        state: Its map, camera and feature space.
+        frame: The frame.
+        mask: ``(H, W)`` its initial mask, or None.
+        pose: Where the object is about.
+        followed: The points that were followed into it.
+    """
+    object_map, camera = state.object_map, state.camera
+    observation = observer.observe(frame, mask, pose, object_map.vertices, camera, state.feature_space)
+    on_object = followed.only(~object_map.candidate[followed.landmark])
+    weight = 1.0 if observer.config.object.trust_masks else mask_weight(mask, on_object)
+    window = cut_around_object(object_map, camera, frame.image, mask, pose)
+    return Keyframe(observation, mask, pose, followed, mask_weight=weight, image=window)
 
 
 def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineConfig) -> bool:

@@ -82,6 +82,11 @@ def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[
     )
 
 
+def extend_trajectory(state: SolverState, pose: Pose, index: int) -> SolverState:
+    """The state with one more tracked frame for the motion model."""
+    return replace(state, trajectory=(*state.trajectory, (pose, index))[-TRAJECTORY_LENGTH:])
+
+
 TRAJECTORY_LENGTH = 5
 """Tracked frames that are extrapolated from."""
 _MAX_EXTRAPOLATION = 12  # frames

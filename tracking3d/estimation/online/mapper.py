@@ -1,4 +1,4 @@
-"""Reverses the map's depth if that explains its keyframes better.
+"""The mapper: inserts a frame into the map, refines it, and reverses its depth if that explains its keyframes better.
 
 The initialization chooses between the two reversals; after a small rotation its choice can be wrong. See
 `tracking3d.bundle_adjustment.adjustment`.
@@ -10,17 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.config.models import OnlineConfig
-from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
+from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, refine_local_map
+from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import (
     shared_landmarks,
     structure_of,
     tracks_of,
     viewing_angle,
 )
-from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
@@ -40,6 +42,28 @@ _LANDMARK_PRIOR = (
     0.05  # cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
 )
 _SCALE = 1.0  # pixels
+
+
+def insert_frame(
+    state: SolverState, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
+) -> SolverState:
+    """The state with its last frame as a new keyframe, and the map refined.
+
+    Args:
+        state: After the frame.
+        view: The frame with its pose and the points that agree with it.
+        image: ``(H, W)`` grey.
+        config: The solver's options.
+    """
+    object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config)
+    state = replace(
+        state,
+        object_map=object_map,
+        surface=object_map.surface(),
+        last_pose=(object_map.keyframes[-1].pose, view.index),
+        tracked_points=followed,
+    )
+    return refine_by_landmarks(fix_depth_reversal(state, config), config)
 
 
 def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:

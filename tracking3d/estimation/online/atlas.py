@@ -28,7 +28,7 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import (
     refine_local_map,
 )
 from tracking3d.estimation.online.mapping.local_mapping import nearest_views, project_points
-from tracking3d.estimation.online.relocalization.pose_search import poses_from_matches
+from tracking3d.estimation.online.relocalization import poses_from_matches
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import RELOCALIZED
-from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping.keyframe_insertion import cut_around_object
-from tracking3d.estimation.online.mapping.local_mapping import mask_weight
-from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.relocalization.pose_search import (
+from tracking3d.estimation.observation import Observer
+from tracking3d.estimation.online.features.klt import follow
+from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
+from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.relocalization import (
     ROTATION_SEARCH,
     overlaps_mask,
     relocalize,
@@ -24,7 +22,11 @@ from tracking3d.estimation.online.relocalization.pose_search import (
 from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion
+from tracking3d.estimation.online.tracking.motion_model import (
+    is_consistent_with_motion,
+    pose_predictions,
+    predict_points,
+)
 from tracking3d.estimation.online.tracking.pose_tracking import (
     find_inliers,
     fit_pose,
@@ -32,28 +34,35 @@ from tracking3d.estimation.online.tracking.pose_tracking import (
     pose_evidence,
     pose_of_points,
 )
-from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
 
 @dataclass(frozen=True)
-class FrameTracker(SolverBase):
+class Tracker:
     """Estimates the pose of an object with a map in one frame."""
 
-    @property
-    def online(self) -> OnlineConfig:
-        """The options of the online solver."""
-        assert isinstance(self.config.solver, OnlineConfig)
-        return self.config.solver
+    observer: Observer  # how a frame becomes an observation
+    weights: PoseWeights  # of a pose's cost terms
 
-    @property
-    def weights(self) -> PoseWeights:
-        """The weights of a pose's cost terms."""
-        weights = self.online.weights
-        return PoseWeights(weights.appearance, outline=weights.outline, points=weights.points)
+    def track(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> PoseCandidate:
+        """The pose in the frame after the state's last one.
 
-    def _find(
+        Args:
+            state: After the frame before.
+            frame: The frame.
+            image: ``(H, W)`` grey.
+            mask: ``(H, W)`` its initial mask, or None.
+        """
+        starts = pose_predictions(state, frame.index, mask)
+        likeliest = next(iter(starts.values()))
+        followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
+        view = view_frame(self.observer, state, frame, mask, likeliest, followed)
+        return self.find(state, view, frame, image, starts)
+
+    def find(
         self,
         state: SolverState,
         view: Keyframe,
@@ -68,7 +77,7 @@ class FrameTracker(SolverBase):
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
         if points is not None:
             starts = {**starts, "points": points[0]}
-        won, fit = self._fit(state, view, starts, view.points)
+        won, fit = fit_pose(object_map, state.surface, view, starts, view.points, self.weights)
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
         if state.phase is SolverPhase.LOST or needs_relocalization(fit, state.baseline, support):
@@ -93,6 +102,23 @@ class FrameTracker(SolverBase):
             return other if other is not None and other.better_than(best) else best
         return best
 
+    def attempt(self, state: SolverState, view: Keyframe, origin: str, guessed: bool) -> PoseCandidate:
+        """The candidate from the pose and the points that a view comes with.
+
+        Args:
+            state: The state with a map.
+            view: The frame seen from that pose.
+            origin: What the pose was found by.
+            guessed: Whether it is a guess, see `assess_pose`.
+        """
+        assert state.surface is not None
+        object_map, camera = state.object_map, state.camera
+        _, fit = fit_pose(object_map, state.surface, view, {origin: view.pose}, view.points, self.weights)
+        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        assessment = assess_pose(fit, state.baseline, support, guessed=guessed)
+        return PoseCandidate(view, fit, origin, kept, support, assessment)
+
     def _elsewhere(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
@@ -104,37 +130,6 @@ class FrameTracker(SolverBase):
             return None
         pose, points = where
         elsewhere = mask is None or not overlaps_mask(state.object_map.silhouette(pose, state.camera), mask)
-        view = self._view(state, frame, None if elsewhere else mask, pose, points)
-        _, fit = self._fit(state, view, {RELOCALIZED: pose}, points)
-        kept = find_inliers(state.object_map, state.camera, fit.pose, points, view)
-        support = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
-        found = PoseCandidate(
-            view, fit, RELOCALIZED, kept, support, assess_pose(fit, state.baseline, support, guessed=True)
-        )
+        view = view_frame(self.observer, state, frame, None if elsewhere else mask, pose, points)
+        found = self.attempt(state, view, RELOCALIZED, guessed=True)
         return None if found.lost else found
-
-    def _fit(
-        self, state: SolverState, view: Keyframe, starts: dict[str, Pose], points: FollowedPoints
-    ) -> tuple[str, PoseFit]:
-        assert state.surface is not None
-        return fit_pose(state.object_map, state.surface, view, starts, points, self.weights)
-
-    def _view(
-        self,
-        state: SolverState,
-        frame: Frame,
-        mask: NDArray[np.bool_] | None,
-        pose: Pose,
-        followed: FollowedPoints,
-    ) -> Keyframe:
-        """A frame seen from a pose, with the mask weight that follows from the points."""
-        on_object = followed.only(~state.object_map.candidate[followed.landmark])
-        observation = self._observe(state, frame, mask, pose)
-        weight = 1.0 if self.config.object.trust_masks else mask_weight(mask, on_object)
-        window = cut_around_object(state.object_map, state.camera, frame.image, mask, pose)
-        return Keyframe(observation, mask, pose, followed, mask_weight=weight, image=window)
-
-    def _observe(
-        self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
-    ) -> Observation:
-        return self.observe(frame, mask, pose, state.object_map.vertices, state.camera, state.feature_space)
