@@ -20,6 +20,7 @@ from tracking3d.estimation.solver import (
     RefiningSolver,
     Solver,
 )
+from tracking3d.estimation.undistortion import Undistortion
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.components import add_times
@@ -47,6 +48,7 @@ class SessionRefinement:
     _solver: Solver[Any] | None
     _state: Any
     _camera: Camera | None
+    _undistortion: Undistortion
     _settings: IsolatedRuntime
     _presented: FrameOrder
     _refined: bool
@@ -89,9 +91,11 @@ class SessionRefinement:
 
     def extend(self, gap: Gap) -> list[FrameEstimate]:
         """Track the object through a gap, before `refine`; no estimates if a plug-in fails."""
+        view = self._undistortion
+        seen = replace(gap, anchor=view.frame(gap.anchor), frames=view.each(gap.frames))
         try:
             with self._settings.in_force(), measure("map") as watch:
-                self._state, estimates = self._refining.extend(self._state, gap)
+                self._state, estimates = self._refining.extend(self._state, seen)
         except PluginFailure:
             return []
         self.refining += watch.times
@@ -128,7 +132,7 @@ class SessionRefinement:
         order, latest = FrameOrder(0), 0
         try:
             with self._settings.in_force(), measure("map") as watch:
-                for frame, mask in frames:
+                for frame, mask in self._undistortion.each(frames):
                     if first is None:
                         first, order = frame, FrameOrder(frame.index)
                         state, estimate = solver.init(frame, mask)
@@ -165,7 +169,9 @@ class SessionRefinement:
             return None, ""
         try:
             with self._settings.in_force(), measure("map") as watch:
-                state, made = self._refining.start_from_photos(self._state, photos)
+                read = photos.read
+                seen = replace(photos, read=lambda indices: self._undistortion.each(read(indices)))
+                state, made = self._refining.start_from_photos(self._state, seen)
         except PluginFailure:
             return None, ""
         self.refining += watch.times
@@ -209,7 +215,7 @@ class SessionRefinement:
     def keep_frame(self, frame: Frame, T_cam_obj: NDArray[np.float64]) -> None:
         """Take a frame whose refined pose ``(4, 4)`` stands, before the next one is refined."""
         with self._settings.in_force():
-            self._state = self._refining.keep_frame(self._state, frame, T_cam_obj)
+            self._state = self._refining.keep_frame(self._state, self._undistortion.frame(frame), T_cam_obj)
 
     @contextmanager
     def state_unchanged(self) -> Iterator[None]:
@@ -237,9 +243,10 @@ class SessionRefinement:
             raise RuntimeError("frames are revisited after refine")
         try:
             with self._settings.in_force(), measure("solve") as watch:
-                shown = self._presented.number(frame)
-                self._state, estimate = solver.refine_frame(self._state, shown, mask, T_cam_obj)
-                estimate = self._presented.index(estimate)
+                shown = self._undistortion.frame(self._presented.number(frame))
+                seen = self._undistortion.mask(mask)
+                self._state, estimate = solver.refine_frame(self._state, shown, seen, T_cam_obj)
+                estimate = self._presented.index(self._undistortion.estimate(estimate, mask))
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         estimate = replace(estimate, refined=True)

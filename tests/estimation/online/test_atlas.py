@@ -202,7 +202,7 @@ def test_a_map_that_stands_aside_goes_through_the_lens_of_the_end():
     state, _ = run(ALONE)
     before = state.camera
     after = before.zoom(1.2, "solved")
-    other = refine_inactive_map(state.inactive_maps[0], before, after, solver().online)
+    other = refine_inactive_map(state.inactive_maps[0], before, after, solver().options)
     # The first keyframe's pose moves with the lens alone.
     (x, y, z), (u, v, w) = (
         one.object_map.keyframes[0].pose.translation.tolist() for one in (state.inactive_maps[0], other)

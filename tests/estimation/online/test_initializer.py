@@ -21,7 +21,7 @@ from tracking3d.estimation.online.initialization.pending_frames import (
     try_initialize,
     why_no_map,
 )
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
+from tracking3d.estimation.online.masks import initial_estimate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 

@@ -32,6 +32,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
 )
 from tracking3d.estimation.online.initialization.photo_tracks import Photo
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import (
     cut_around_object,
     insert_points,
@@ -39,8 +40,7 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import (
     refine_local_map,
     view_frame,
 )
-from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
-from tracking3d.estimation.online.masks.frame_estimates import (
+from tracking3d.estimation.online.masks import (
     initial_estimate,
     learn_colours,
     make_estimate,
@@ -48,18 +48,18 @@ from tracking3d.estimation.online.masks.frame_estimates import (
 )
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseWeights
-from tracking3d.estimation.online.relocalization import poses_from_matches
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate, assess_pose
-from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import TRAJECTORY_LENGTH
-from tracking3d.estimation.online.tracking.pose_tracking import (
+from tracking3d.estimation.online.pose_tracking import (
+    TRAJECTORY_LENGTH,
     find_inliers,
     fit_pose,
     pixel_scale,
     pose_evidence,
     resect_pose,
 )
+from tracking3d.estimation.online.relocalization import poses_from_matches
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate, assess_pose
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.shape import Shape, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.solver import PhotoEstimates, PhotoSet
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
@@ -250,11 +250,9 @@ class Initializer:
             object_map = refine_local_map(
                 start.object_map, camera, everything, self.options, bundle_iterations=20, rounds=3
             )
-            updated = replace(
-                state,
+            updated = state.with_map(
+                object_map,
                 camera=camera,
-                object_map=object_map,
-                surface=object_map.surface(),
                 pending=None,
                 rested=(),
                 revisable=waiting if start.object_map.pointless and not self.in_background else (),
@@ -446,4 +444,4 @@ def _with_keyframe(state: SolverState, found: PoseCandidate, config: OnlineConfi
     object_map = refine_local_map(
         object_map, state.camera, everything, config, bundle_iterations=10, rounds=1
     )
-    return replace(state, object_map=object_map, surface=object_map.surface())
+    return state.with_map(object_map)

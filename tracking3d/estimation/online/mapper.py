@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, refine_local_map
-from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import (
     shared_landmarks,
     structure_of,
@@ -56,13 +56,8 @@ def insert_frame(
         config: The solver's options.
     """
     object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config)
-    state = replace(
-        state,
-        object_map=object_map,
-        surface=object_map.surface(),
-        last_pose=(object_map.keyframes[-1].pose, view.index),
-        tracked_points=followed,
-    )
+    last = object_map.keyframes[-1].pose, view.index
+    state = state.with_map(object_map, last_pose=last, tracked_points=followed)
     return refine_by_landmarks(fix_depth_reversal(state, config), config)
 
 
@@ -82,16 +77,13 @@ def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
     object_map = refine_local_map(
         object_map, state.camera, everything, config, bundle_iterations=20, rounds=2
     )
-    before = state.previous_pose and (
-        _reverse_pose(state.previous_pose[0], reversal),
-        state.previous_pose[1],
-    )
-    trail = tuple((_reverse_pose(pose, reversal), index) for pose, index in state.trajectory)
     last = object_map.keyframes[-1].pose, state.last_pose[1]
-    return replace(
-        state, object_map=object_map, surface=object_map.surface(), last_pose=last, previous_pose=before,
-        trajectory=trail, motion_references=(), reversal_attempt=(0, 0.0),
-    )  # fmt: skip
+
+    def reverse(pose: Pose) -> Pose:
+        T = reversal.poses(pose.matrix().numpy())
+        return pose_from_arrays(T[:3, :3], T[:3, 3], pose.translation)
+
+    return state.moved(object_map, reverse, last_pose=last, reversal_attempt=(0, 0.0))
 
 
 def _due(tried: tuple[int, float], keyframes: int, turned: float) -> bool:
@@ -135,8 +127,3 @@ def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, O
         for view, pose in zip(views, poses, strict=True)
     )
     return reversal, replace(object_map, vertices=surface, landmarks=landmarks, keyframes=keyframes)
-
-
-def _reverse_pose(pose: Pose, reversal: Reversal) -> Pose:
-    T = reversal.poses(pose.matrix().numpy())
-    return pose_from_arrays(T[:3, :3], T[:3, 3], pose.translation)

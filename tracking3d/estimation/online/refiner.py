@@ -25,10 +25,10 @@ from tracking3d.estimation.online.mapping.global_refinement import refine_global
 from tracking3d.estimation.online.mapping.keyframe_insertion import prune_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import refine_map
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.pose_tracking import extend_trajectory
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import extend_trajectory
 from tracking3d.estimation.solver import Gap, ModelCoverage, RefinedStart
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.geometry.camera import Camera
@@ -59,11 +59,9 @@ def refine_active_map(state: SolverState, config: OnlineConfig) -> SolverState:
 
 def _with_final_map(state: SolverState, object_map: ObjectMap, camera: Camera) -> SolverState:
     """The state with a map that frames are estimated with in order of time, the first one next."""
-    return replace(
-        state,
+    return state.with_map(
+        object_map,
         camera=camera,
-        object_map=object_map,
-        surface=object_map.surface(),
         previous_pose=None,
         lost_frames=0,
         doubtful_frames=0,
@@ -227,11 +225,9 @@ def prepare_extension(
     object_map = _remove_unsupported(object_map, explained)
     object_map, camera = refine_globally(object_map, state.camera, config)
     anchors = explained.intersection(view.index for view in object_map.keyframes)
-    state = replace(
-        state,
+    state = state.with_map(
+        object_map,
         camera=camera,
-        object_map=object_map,
-        surface=object_map.surface(),
         reinitialization=None,
         inactive_maps=tuple(
             inactive_map_through_lens(other, state.camera, camera) for other in state.inactive_maps
@@ -322,13 +318,7 @@ def leave_gap(state: SolverState, gap: Gap, number: int) -> SolverState:
     keyframes = tuple(found[index] for index in sorted(found))
     object_map = replace(state.object_map, keyframes=keyframes, asked_landmarks=-1)
     object_map = prune_landmarks(object_map, FollowedPoints.none())[0]
-    return replace(
-        state,
-        object_map=object_map,
-        surface=object_map.surface(),
-        trajectory=(),
-        tracked_points=FollowedPoints.none(),
-    )
+    return state.with_map(object_map, trajectory=(), tracked_points=FollowedPoints.none())
 
 
 def _is_explained(other: InactiveMap, found: Collection[int]) -> bool:

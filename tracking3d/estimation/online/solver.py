@@ -18,38 +18,29 @@ from numpy.typing import NDArray
 from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.observation import Observer
-from tracking3d.estimation.online import refiner
-from tracking3d.estimation.online.atlas import (
-    activate_largest_map,
-    activate_map,
-    colours_match,
-    frames_of_map,
-    guess_alignment,
-    is_fully_visible,
-    is_reliable,
-    map_of_frame,
-    mark_unaligned,
-    masks_overlap,
-    merge_maps,
-    needs_second_map,
-    refine_inactive_map,
-    switch_map,
-    transform_estimates,
-)
+from tracking3d.estimation.online import atlas, refiner
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initializer import Initializer
 from tracking3d.estimation.online.mapper import insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, view_frame
-from tracking3d.estimation.online.masks.frame_estimates import (
+from tracking3d.estimation.online.masks import (
     initial_estimate,
     learn_colours,
     make_estimate,
     mask_agreement,
     measure_mask_agreement,
+    motion_cue_in_window,
+    remember_motion,
 )
-from tracking3d.estimation.online.masks.mask_fusion import motion_cue_in_window, remember_motion
 from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.pose_tracking import (
+    advance,
+    extend_trajectory,
+    extrapolate_motion,
+    pose_predictions,
+    resect_pose,
+)
 from tracking3d.estimation.online.relocalization import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, is_high_loss, is_misfit
 from tracking3d.estimation.online.state.solver_state import (
@@ -59,13 +50,6 @@ from tracking3d.estimation.online.state.solver_state import (
     thin_out,
 )
 from tracking3d.estimation.online.tracker import Tracker
-from tracking3d.estimation.online.tracking.motion_model import (
-    advance,
-    extend_trajectory,
-    extrapolate_motion,
-    pose_predictions,
-)
-from tracking3d.estimation.online.tracking.pose_tracking import resect_pose
 from tracking3d.estimation.shape import first_mask
 from tracking3d.estimation.solver import (
     STATE_CLASSES,
@@ -134,10 +118,10 @@ class OnlineSolver:
             return self.initializer.add(state, frame, image, binary)
         state, revised = self.initializer.restart_if_misfit(state)
         state, estimate = self._track(state, frame, image, binary, self.options)
-        if binary is not None and needs_second_map(state, image, binary):
+        if binary is not None and atlas.needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, image, binary)
         estimate = replace(estimate, revised=(*revised, *estimate.revised))
-        return state, mark_unaligned(estimate) if state.unaligned else estimate
+        return state, atlas.mark_unaligned(estimate) if state.unaligned else estimate
 
     def _track(
         self,
@@ -163,7 +147,7 @@ class OnlineSolver:
             with in_stage("map"):
                 view = replace(found.view, pose=pose, points=found.points)
                 updated = insert_frame(updated, view, image, options)
-                updated = merge_maps(updated, options, updated.object_map.keyframes[-1:])
+                updated = atlas.merge_maps(updated, options, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)
             pose = updated.last_pose[0]
@@ -204,30 +188,30 @@ class OnlineSolver:
         """
         searched = state.phase is SolverPhase.LOST and should_retry(state.lost_frames)
         for other in state.inactive_maps if searched else ():
-            other_state = activate_map(state, other, frame.index)
+            other_state = atlas.activate_map(state, other, frame.index)
             updated, found = self._track(other_state, frame, image, mask, self.options)
             if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
                 return updated, found
         begun, last = state.reinitialization, None
         if begun is not None and begun.pending:
             last = begun.pending[-1][0].mask
-        if begun is None or not masks_overlap(last, mask):
-            if not is_fully_visible(mask) or not colours_match(state, frame, mask):
+        if begun is None or not atlas.masks_overlap(last, mask):
+            if not atlas.is_fully_visible(mask) or not atlas.colours_match(state, frame, mask):
                 return replace(state, reinitialization=None), estimate
             second, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
             return replace(state, reinitialization=second), estimate
         begun, again = self.initializer.add(begun, frame, image, mask)
         if begun.phase is SolverPhase.INITIALIZING:
             return replace(state, reinitialization=begun), estimate
-        if not is_reliable(begun, again):
+        if not atlas.is_reliable(begun, again):
             return replace(state, reinitialization=None), estimate
         state = state_through_lens(state, begun.camera)
-        similarity = guess_alignment(state, begun)
-        switched = switch_map(state, begun, similarity)
-        again = transform_estimates(again, similarity, state.camera)
+        similarity = atlas.guess_alignment(state, begun)
+        switched = atlas.switch_map(state, begun, similarity)
+        again = atlas.transform_estimates(again, similarity, state.camera)
         if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
             return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
-        return switched, mark_unaligned(again)
+        return switched, atlas.mark_unaligned(again)
 
     def refine(self, state: SolverState) -> SolverState:
         """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
@@ -236,15 +220,16 @@ class OnlineSolver:
             state = self.initializer.finish(state)
         if state.phase is SolverPhase.INITIALIZING:
             return state
-        state = merge_maps(state, self.options, state.object_map.keyframes)
-        state = activate_largest_map(
+        state = atlas.merge_maps(state, self.options, state.object_map.keyframes)
+        state = atlas.activate_largest_map(
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
         )
         before, state = state.camera, refiner.refine_active_map(state, self.options)
         if self.config.has_given_masks:
             state = replace(state, mask_agreement=mask_agreement(state.object_map, state.camera))
         others = (
-            refine_inactive_map(other, before, state.camera, self.options) for other in state.inactive_maps
+            atlas.refine_inactive_map(other, before, state.camera, self.options)
+            for other in state.inactive_maps
         )
         return replace(state, inactive_maps=tuple(others))
 
@@ -252,7 +237,7 @@ class OnlineSolver:
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[SolverState, FrameEstimate]:
         """Estimate a frame's pose again, with the final map."""
-        state, frame = map_of_frame(state, frame.index), mask.on(frame)
+        state, frame = atlas.map_of_frame(state, frame.index), mask.on(frame)
         binary, image, object_map = mask.found, grey(frame.image), state.object_map
         T_cam_obj = state.extended.get(frame.index, T_cam_obj)
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
@@ -278,13 +263,13 @@ class OnlineSolver:
         estimate = make_estimate(
             updated, initial_estimate(frame, binary, found.fit.pose, state.camera), found
         )
-        return updated, replace(mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
+        return updated, replace(atlas.mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
         state, _ = self.finish_background_work(state)
         if state.inactive_maps:
-            state = activate_largest_map(state)
+            state = atlas.activate_largest_map(state)
         object_map = state.object_map
         if not object_map.keyframes:
             object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
@@ -305,8 +290,8 @@ class OnlineSolver:
             return None
         last = state.last_pose[1]
         spans = (*state.spans, (state.active_since, last))
-        state = activate_largest_map(replace(state, spans=spans, active_since=last + 1))
-        own = {index: confidence[index] for index in frames_of_map(state, confidence)}
+        state = atlas.activate_largest_map(replace(state, spans=spans, active_since=last + 1))
+        own = {index: confidence[index] for index in atlas.frames_of_map(state, confidence)}
         return refiner.prepare_extension(state, own, self.options)
 
     def extend(self, state: SolverState, gap: Gap) -> tuple[SolverState, list[FrameEstimate]]:
@@ -324,8 +309,7 @@ class OnlineSolver:
 
     end_extension = staticmethod(refiner.end_extension)
 
-    @staticmethod
-    def start_from(state: SolverState, poses: Mapping[int, NDArray[np.float64]]) -> SolverState:
+    def start_from(self, state: SolverState, poses: Mapping[int, NDArray[np.float64]]) -> SolverState:
         """The state that refines frames from other poses than the causal ones."""
         return replace(state, extended=dict(poses))
 

@@ -12,6 +12,16 @@ from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
 from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.pose_tracking import (
+    find_inliers,
+    fit_pose,
+    is_consistent_with_motion,
+    pixel_scale,
+    pose_evidence,
+    pose_of_points,
+    pose_predictions,
+    predict_points,
+)
 from tracking3d.estimation.online.relocalization import (
     ROTATION_SEARCH,
     overlaps_mask,
@@ -22,18 +32,6 @@ from tracking3d.estimation.online.relocalization import (
 from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import (
-    is_consistent_with_motion,
-    pose_predictions,
-    predict_points,
-)
-from tracking3d.estimation.online.tracking.pose_tracking import (
-    find_inliers,
-    fit_pose,
-    pixel_scale,
-    pose_evidence,
-    pose_of_points,
-)
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
@@ -81,16 +79,7 @@ class Tracker:
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
         if state.phase is SolverPhase.LOST or needs_relocalization(fit, state.baseline, support):
-            won, fit, kept = relocalize(
-                object_map,
-                state.surface,
-                camera,
-                view,
-                image,
-                (won, fit, kept),
-                self.weights,
-                state.lost_frames,
-            )
+            won, fit, kept = relocalize(state, view, image, (won, fit, kept), self.weights)
             support = pose_evidence(object_map, camera, fit.pose, kept, view)
         astray = state.phase is SolverPhase.LOST and not is_consistent_with_motion(
             state, fit.pose, frame.index
