@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 
 import torch
 
-from tracking3d.estimation.online import solver
-from tracking3d.estimation.online.initialization import initializer
+from tracking3d.estimation.online import refiner
+from tracking3d.estimation.online.initialization import pending_frames
 from tracking3d.synthesis import convex_clips
 from tracking3d.trackers import first_mask
 from tracking3d_bench.benchmark import feature_encoders
@@ -95,5 +95,5 @@ def make_once() -> None:
         lambda spec: (spec.object, spec.textured, spec.print_strength == 0, spec.seed),
     )
     ray_casting._corner_normals = MadeOnce(ray_casting._corner_normals, lambda *mesh: mesh[:2])
-    initializer.solve_start = MadeOnce(initializer.solve_start)
-    solver.refine_globally = MadeOnce(solver.refine_globally)
+    pending_frames.solve_start = MadeOnce(pending_frames.solve_start)
+    refiner.refine_globally = MadeOnce(refiner.refine_globally)

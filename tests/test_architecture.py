@@ -15,14 +15,14 @@ LONGEST_FUNCTION = 80
 MOST_PARAMETERS = 12
 
 # Today's figures, to be lowered as steps of the house land, and raised by nobody without a reason.
-DEEPEST_INHERITANCE = 7
-MOST_IMPORT_LINES = 0.094
+DEEPEST_INHERITANCE = 2
+MOST_IMPORT_LINES = 0.0805
 """Share of all lines."""
 
 SMALL_MODULE = 120
 """Lines below which a module that one other of its room alone imports belongs into that one."""
 
-MOST_LONE_SMALL_MODULES = 79
+MOST_LONE_SMALL_MODULES = 20
 MODULES_IN_A_FOLDER = 25
 FULLER_FOLDERS = {
     "cli": 26,
@@ -44,7 +44,7 @@ ROOM_LINES = {
     "config": 1500,
     "engines": 950,
     "errors": 50,
-    "estimation": 12100,
+    "estimation": 11500,
     "export": 2750,
     "features": 650,
     "frames": 150,
@@ -98,20 +98,16 @@ ONLINE_FLOORS = [
     {"state"},
     {"mapping"},
     {"initialization"},
-    {"tracking"},
+    {"pose_tracking"},
     {"masks"},
     {"relocalization"},
-    {"atlas"},
-    {"first_estimates", "frame_tracker"},
-    {"continued_refinement"},
-    {"frame_mapping"},
-    {"map_extension"},
-    {"map_initialization"},
-    {"user_guidance"},
+    {"atlas", "initializer", "mapper", "refiner", "tracker"},
     {"solver"},
     {"known_object"},
 ]
-"""The rooms of the solver ``online``, from the ground: each imports from itself and from lower floors only."""
+"""The rooms of the solver ``online``, from the ground: each imports from itself and from lower floors only.
+
+The components of `OnlineSolver` share a floor, so that they do not know one another."""
 
 
 def floor(room: str, floors: list[set[str]] = FLOORS) -> int:

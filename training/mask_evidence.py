@@ -23,8 +23,8 @@ from scipy.optimize import minimize
 
 from tracking3d import load_config
 from tracking3d.errors import InputError
-from tracking3d.estimation.online.masks import frame_estimates
-from tracking3d.estimation.online.masks.mask_fusion import mask_in_window, upsampled_window
+from tracking3d.estimation.online import masks
+from tracking3d.estimation.online.masks import mask_in_window, upsampled_window
 from tracking3d.segmentation import SOURCES, as_lab, online_features, pixel_features
 from tracking3d_bench.benchmark.job import Job, run_job
 from tracking3d_bench.benchmark.variant import Variant
@@ -86,7 +86,7 @@ def sampled(found: NDArray[np.float32], seed: int) -> NDArray[np.intp]:
 @contextmanager
 def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
     """While a sequence is tracked, note what the sources say in each frame."""
-    original = frame_estimates.fuse_mask
+    original = masks.fuse_mask
 
     def noting(rendered, initial, observation, confidence, colours, moving=None):
         exact = truth.masks[observation.index].read() if observation.index in truth.masks else None
@@ -102,11 +102,11 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
             into.append(Samples(rows, masks[2].ravel()[chosen], weight, number))
         return original(rendered, initial, observation, confidence, colours, moving)
 
-    frame_estimates.fuse_mask = noting
+    masks.fuse_mask = noting
     try:
         yield
     finally:
-        frame_estimates.fuse_mask = original
+        masks.fuse_mask = original
 
 
 def collected(folders: list[Path], out: Path, tracker: str) -> Samples:

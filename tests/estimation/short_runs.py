@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.paper.solver import PaperSolver
-from tracking3d.estimation.paper.state import PaperState
+from tracking3d.estimation.paper.solver import PaperSolver, PaperState
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate

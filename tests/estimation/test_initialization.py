@@ -11,8 +11,14 @@ import torch
 from short_runs import quick_solver, run, short_clip
 
 from tracking3d.estimation.paper.problem import Parameters
-from tracking3d.estimation.paper.solver import DIRECTIONS, RATES, hypotheses, initialize_jointly
-from tracking3d.estimation.paper.state import PaperState, PosedObservation
+from tracking3d.estimation.paper.solver import (
+    DIRECTIONS,
+    RATES,
+    PaperState,
+    PosedObservation,
+    hypotheses,
+    initialize_jointly,
+)
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about, rotation_angle
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

@@ -10,8 +10,7 @@ import torch
 from short_runs import quick_solver, run, short_clip, true_mask
 
 from tracking3d.estimation.observation import mask_box, projected_box
-from tracking3d.estimation.paper.solver import candidate_poses, shift_to_mask
-from tracking3d.estimation.paper.state import PaperState
+from tracking3d.estimation.paper.solver import PaperState, candidate_poses, shift_to_mask
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d_bench.evaluation.metrics import mask_iou
 

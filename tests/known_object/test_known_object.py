@@ -11,17 +11,19 @@ from tracking3d import Frame, Prompt, Session, Status, track, track_objects
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import RELOCALIZED
-from tracking3d.estimation.online.known_object import rendered_keyframes
-from tracking3d.estimation.online.known_object.solver import NOT_SEEN
+from tracking3d.estimation.online import known_object
+from tracking3d.estimation.online.known_object import NOT_SEEN
+from tracking3d.pipeline.frame_reading import FrameOrder
 from tracking3d.pipeline.known_object import read_known_object
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
+from tracking3d.pipeline.session_refinement import Attempt
 from tracking3d_bench.evaluation.metrics import mask_iou
 
 
 @pytest.fixture
 def few_sides(monkeypatch):
     """Enough for a box, and drawn in a moment."""
-    monkeypatch.setattr(rendered_keyframes, "SIDES", 14)
+    monkeypatch.setattr(known_object, "SIDES", 14)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,19 @@ def test_without_colours_its_outline_tells_where_a_box_is_and_else_nothing_does(
         degrees_between(first.T_cam_obj, clip.scene.T_cam_obj[0] @ turn) for turn in half_turns_of_a_box()
     ]
     assert min(half_turns) < 5
+
+
+def test_poses_to_start_from_are_in_its_own_coordinates_as_estimates_are(clip, tmp_path, few_sides):
+    mesh = mesh_of(clip.scene.solid)
+    mesh.apply_scale(1000.0)
+    mesh.apply_translation((5.0, -700.0, 90.0))
+    mesh.export(tmp_path / "thing.glb")
+    session = Session(config(object={"model": str(tmp_path / "thing.glb")}), None)
+    T_cam_obj = session.step(Frame(0, clip.images[0])).T_cam_obj
+    session.adopt(Attempt(session._state, FrameOrder(0), {0: T_cam_obj}, {0: 1.0}))
+    start = session._state.extended[0]
+    assert 1 < start[2, 3] < 20  # the solver's unit is a radius of about 1
+    np.testing.assert_allclose(session._known.from_solver(start), T_cam_obj)
 
 
 def half_turns_of_a_box():
@@ -126,8 +141,8 @@ def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, f
     from tracking3d.pipeline.components import build_encoder
 
     settings = config()
-    learnt, space = rendered_keyframes.map_of_known_object(
-        known, settings, build_encoder(settings), rendered_keyframes.torch.device("cpu")
+    learnt, space = known_object.map_of_known_object(
+        known, settings, build_encoder(settings), known_object.torch.device("cpu")
     )
     camera = Camera.from_fov(320, 320, 30.0)
     assert learnt.fixed_keyframes == len(learnt.keyframes) == 14 and space is not None
@@ -140,8 +155,8 @@ def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, f
 
 
 def test_sides_are_spread_all_around():
-    axes = np.stack([R[2] for R in rendered_keyframes.sides(42)])
-    for R in rendered_keyframes.sides(42):
+    axes = np.stack([R[2] for R in known_object.sides(42)])
+    for R in known_object.sides(42):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) > 0
     nearest = np.degrees(np.arccos(np.sort(axes @ axes.T, 1)[:, -2]))

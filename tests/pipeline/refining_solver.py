@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.frames import Frame, MaskEstimate
 
 
@@ -70,7 +71,7 @@ class CausalSolver:
         )
 
 
-class StandInSolver(CausalSolver):
+class StandInSolver(CausalSolver, RefiningSolver):
     """Can refine: the mesh is then twice as large, and a revisited pose is the causal one, one further away."""
 
     revisit_faults: ClassVar[dict[int, BaseException]] = {}

@@ -11,6 +11,7 @@ from rendered_views import ball, pattern, pose, seen
 
 from tracking3d import load_config
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS
@@ -21,7 +22,7 @@ from tracking3d.video import open_source
 YAWS = (0, 15, 30)
 
 
-class KnowingSolver:
+class KnowingSolver(RefiningSolver):
     """Answers with the truth of the ball; tracked or not in the second pass, as ``status`` says."""
 
     status = Status.TRACKED

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d import Frame, Session, load_config
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.atlas.atlas import match_landmarks, merge, transform_map
+from tracking3d.estimation.online.atlas import match_landmarks, merge, transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Prompt

@@ -13,6 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
+from tracking3d.config.models import PipelineConfig
+from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Camera, Window
@@ -260,3 +262,45 @@ def outline_distance(mask: Tensor, valid: Tensor) -> Tensor:
     _, nearest = distance_transform_edt(~inside.cpu().numpy(), return_indices=True)
     row, column = (torch.from_numpy(np.ascontiguousarray(axis)).to(mask.device) for axis in nearest)
     return torch.where(inside, signed_distance(mask[row.long(), column.long()][None])[0], 0.0)
+
+
+@dataclass(frozen=True)
+class Observer:
+    """How a frame becomes an observation."""
+
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame, as it was known before the first frame
+    encoder: FeatureEncoder  # the feature encoder
+
+    @property
+    def device(self) -> torch.device:
+        """The device of all tensors."""
+        return torch.device(self.config.runtime.device)
+
+    def observe(
+        self,
+        frame: Frame,
+        mask: NDArray[np.bool_] | None,
+        pose: Pose,
+        vertices: Tensor,
+        camera: Camera,
+        space: FeatureSpace | None,
+    ) -> Observation:
+        """Crop a frame around the object and encode the crop.
+
+        Args:
+            frame: The frame.
+            mask: Mask of the object ``(H, W)``, around which the frame is cropped; None if there is none.
+            pose: Expected pose; without a mask the frame is cropped around the object there.
+            vertices: Vertices of the object ``(V, 3)``.
+            camera: Camera of the frame.
+            space: Subspace that features are projected into, if they are.
+        """
+        box = mask_box(mask) if mask is not None else projected_box(vertices, camera, pose)
+        if box is None:
+            box = (0.0, 0.0, float(camera.width), float(camera.height))
+        window = Window.around(box, self.config.crop.margin, self.config.crop.size)
+        observation = observe(frame, mask, window, camera, self.encoder, self.device)
+        if space is None:
+            return observation
+        return replace(observation, features=space.project(observation.features, observation.image))

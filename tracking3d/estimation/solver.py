@@ -62,7 +62,10 @@ class Solver(Protocol, Generic[State]):
 
 @runtime_checkable
 class RefiningSolver(Protocol, Generic[State]):
-    """A solver that can look at a whole video once more, when it has ended."""
+    """A solver that can look at a whole video once more, when it has ended, and goes on as the user says.
+
+    What has an answer here need not be implemented: it then cannot be done, or nothing has to be.
+    """
 
     def refine(self, state: State) -> State:
         """Solve everything once more over all keyframes; the state is then for ``refine_frame`` and ``result`` only."""
@@ -81,97 +84,6 @@ class RefiningSolver(Protocol, Generic[State]):
         """
         ...
 
-
-@runtime_checkable
-class ContinuingSolver(Protocol, Generic[State]):
-    """A refining solver that can start from an earlier refinement, of which most frames keep their estimates."""
-
-    def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
-        """The state for ``refine_frame`` and ``result``, in place of ``refine``; None if it does not fit ``start``."""
-        ...
-
-    def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
-        """Take a frame whose refined pose ``(4, 4)`` stands, before ``refine_frame`` takes the next one."""
-        ...
-
-    def keyframe_poses(self, state: State) -> Mapping[int, NDArray[np.float64]]:
-        """Refined poses ``(4, 4)`` of the keyframes after ``refine``, by frame index; none if they do not tell how the
-        refinement moved the causal poses."""
-        ...
-
-
-@runtime_checkable
-class ExtendingSolver(Protocol, Generic[State]):
-    """A refining solver that can track the object into frames that were not explained, before it refines everything."""
-
-    def begin_extension(
-        self, state: State, confidence: Mapping[int, float]
-    ) -> tuple[State, ModelCoverage] | None:
-        """The state for ``extend``, and what the model explains; None if there is nothing to start from.
-
-        Args:
-            state: After the last frame.
-            confidence: Of the causal estimate of each frame, by index, with the model that it was made with.
-        """
-        ...
-
-    def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
-        """Track the object through a gap, and learn from it; the gap's anchor is one of ``ModelCoverage.anchors``."""
-        ...
-
-    def end_extension(self, state: State, found: Collection[int], last: int) -> State:
-        """The state for ``refine``.
-
-        Args:
-            state: After the last gap.
-            found: Indices of the frames of gaps in which the object was found.
-            last: Index of the last frame of the video.
-        """
-        ...
-
-    def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
-        """The state that refines frames from other poses ``(4, 4)`` than the causal ones, by frame index."""
-        ...
-
-
-@runtime_checkable
-class PhotoSolver(Protocol, Generic[State]):
-    """A solver that can start from photos, whatever their order and the turn between them."""
-
-    def has_points(self, state: State, ended: bool) -> bool:
-        """Whether there is a map with points after the last frame; if it has ``ended``, also one made only then."""
-        ...
-
-    def start_from_photos(self, state: State, photos: PhotoSet) -> tuple[State, PhotoEstimates]:
-        """The state for ``refine`` with a map of the photos, in place of any that there is.
-
-        If the photos cannot be joined, it is the same state, which knows the reason.
-        """
-        ...
-
-
-@runtime_checkable
-class LiveSolver(Protocol, Generic[State]):
-    """A solver that can do long work in another thread, so that a live source's frames do not wait for it."""
-
-    def for_live_source(self) -> Self:
-        """The same solver for a live source; the result then depends on how fast the machine is."""
-        ...
-
-    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
-        """Wait for what is still computed in other threads.
-
-        Returns:
-            The state with its result, and an estimate of the last frame with those of earlier frames in ``revised``;
-            None if there is nothing new.
-        """
-        ...
-
-
-@runtime_checkable
-class GuidedSolver(Protocol, Generic[State]):
-    """A solver that goes on as the user says: backwards from the first frame, and by a mask that is right."""
-
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> State:
@@ -188,6 +100,76 @@ class GuidedSolver(Protocol, Generic[State]):
     def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
         """The state before ``step`` takes a frame whose mask ``(H, W)`` the user has given."""
         ...
+
+    def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
+        """The state for ``refine_frame`` and ``result`` from an earlier refinement, of which most frames keep their
+        estimates, in place of ``refine``; None if it does not fit ``start``."""
+        return None
+
+    def keep_frame(self, state: State, frame: Frame, T_cam_obj: NDArray[np.float64]) -> State:
+        """Take a frame whose refined pose ``(4, 4)`` stands, before ``refine_frame`` takes the next one."""
+        return state
+
+    def keyframe_poses(self, state: State) -> Mapping[int, NDArray[np.float64]]:
+        """Refined poses ``(4, 4)`` of the keyframes after ``refine``, by frame index; none if they do not tell how the
+        refinement moved the causal poses."""
+        return {}
+
+    def begin_extension(
+        self, state: State, confidence: Mapping[int, float]
+    ) -> tuple[State, ModelCoverage] | None:
+        """The state for ``extend``, which tracks the object into frames that were not explained, before everything is
+        refined, and what the model explains; None if there is nothing to start from.
+
+        Args:
+            state: After the last frame.
+            confidence: Of the causal estimate of each frame, by index, with the model that it was made with.
+        """
+        return None
+
+    def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
+        """Track the object through a gap, and learn from it; the gap's anchor is one of ``ModelCoverage.anchors``."""
+        return state, []
+
+    def end_extension(self, state: State, found: Collection[int], last: int) -> State:
+        """The state for ``refine``.
+
+        Args:
+            state: After the last gap.
+            found: Indices of the frames of gaps in which the object was found.
+            last: Index of the last frame of the video.
+        """
+        return state
+
+    def start_from(self, state: State, poses: Mapping[int, NDArray[np.float64]]) -> State:
+        """The state that refines frames from other poses ``(4, 4)`` than the causal ones, by frame index."""
+        return state
+
+    def has_points(self, state: State, ended: bool) -> bool:
+        """Whether there is a map with points after the last frame; if it has ``ended``, also one made only then."""
+        return True
+
+    def start_from_photos(self, state: State, photos: PhotoSet) -> tuple[State, PhotoEstimates]:
+        """The state for ``refine`` with a map of photos, whatever their order and the turn between them, in place of
+        any that there is.
+
+        If the photos cannot be joined, it is the same state, which knows the reason.
+        """
+        return state, PhotoEstimates((), "")
+
+    def for_live_source(self) -> Self:
+        """The solver that does long work in another thread, so that a live source's frames do not wait for it; the
+        result then depends on how fast the machine is."""
+        return self
+
+    def finish_background_work(self, state: State) -> tuple[State, FrameEstimate | None]:
+        """Wait for what is still computed in other threads.
+
+        Returns:
+            The state with its result, and an estimate of the last frame with those of earlier frames in ``revised``;
+            None if there is nothing new.
+        """
+        return state, None
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from tracking3d.estimation.estimate import (
     mark_failed,
     with_initial_mask,
 )
-from tracking3d.estimation.solver import GuidedSolver, LiveSolver, Solver
-from tracking3d.estimation.undistortion import undistort_solver
+from tracking3d.estimation.solver import RefiningSolver, Solver
+from tracking3d.estimation.undistortion import Undistortion
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
@@ -99,6 +99,7 @@ class Session(SessionRefinement):
         self._solver: Solver[Any] | None = None
         self._state: Any = None
         self._camera: Camera | None = None
+        self._undistortion = Undistortion(None)
         self._first: Frame | None = None
         self._presented, self._latest = FrameOrder(0), 0
         self.initial_mask = MaskEstimate(None)
@@ -150,8 +151,8 @@ class Session(SessionRefinement):
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
-        self._state, estimate = solver.init(frame, mask)
-        estimate = replace(estimate, occluder=mask.occluder)
+        self._state, estimate = solver.init(self._undistortion.frame(frame), self._undistortion.mask(mask))
+        estimate = replace(self._undistortion.estimate(estimate, mask), occluder=mask.occluder)
         if self.config.object.trust_masks:
             estimate = with_initial_mask(estimate)
         self._solver, self.initial_mask = solver, mask
@@ -169,9 +170,9 @@ class Session(SessionRefinement):
         self._camera = select_camera(self.config, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, FrameOrder(first.index), first.index
+        self._undistortion = Undistortion(self._camera.lens)
         solver = build_solver(self.config, self._camera, self._encoder, self._known)
-        solver = undistort_solver(self._camera.lens, solver)
-        return solver.for_live_source() if self._live and isinstance(solver, LiveSolver) else solver
+        return solver.for_live_source() if self._live and isinstance(solver, RefiningSolver) else solver
 
     @property
     def state_classes(self) -> tuple[type, ...]:
@@ -204,13 +205,13 @@ class Session(SessionRefinement):
         return late
 
     def _finish_background_work(self) -> list[FrameEstimate]:
-        if not (self._live and isinstance(self._solver, LiveSolver)):
+        if not (self._live and isinstance(self._solver, RefiningSolver)):
             return []
         with self._settings.in_force():
             self._state, found = self._solver.finish_background_work(self._state)
         if found is None:
             return []
-        found = self._presented.index(found)
+        found = self._presented.index(self._undistortion.estimate(found))
         self._last_pose, self._camera = found.T_cam_obj, found.camera or self._camera
         return [self._with_failure(one) for one in (*found.revised, replace(found, revised=()))]
 
@@ -287,11 +288,13 @@ class Session(SessionRefinement):
             mask = replace(self.initial_mask, score=0.0, reason=error.reason)
         self.initial_mask = mask
         try:
-            shown = self._presented.number(frame)
-            if prompt is not None and mask.found is not None and isinstance(solver, GuidedSolver):
-                self._state = solver.trust_mask(self._state, shown, mask.found)
-            self._state, estimate = solver.step(self._state, shown, mask)
-            estimate = replace(self._presented.index(estimate), occluder=mask.occluder)
+            shown = self._undistortion.frame(self._presented.number(frame))
+            if prompt is not None and mask.found is not None and isinstance(solver, RefiningSolver):
+                trusted = self._undistortion.binary(mask.found)
+                self._state = solver.trust_mask(self._state, shown, trusted)
+            self._state, estimate = solver.step(self._state, shown, self._undistortion.mask(mask))
+            estimate = self._presented.index(self._undistortion.estimate(estimate, mask))
+            estimate = replace(estimate, occluder=mask.occluder)
             if self.config.object.trust_masks:
                 estimate = with_initial_mask(estimate)
         except PluginFailure as error:
@@ -326,8 +329,9 @@ class Session(SessionRefinement):
                 self._latest = frame.index
             else:
                 check_backward_tracking(self.config)
-                assert isinstance(solver, GuidedSolver)
+                assert isinstance(solver, RefiningSolver)
                 self._presented = FrameOrder(first.index, self._latest)
+                first = self._undistortion.frame(first)
                 self._state = solver.restart_backwards(self._state, first, self._latest, self._first_pose)
         return solver
 

@@ -13,17 +13,14 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask
 from tracking3d.estimation.solver import (
-    ContinuingSolver,
-    ExtendingSolver,
     Gap,
-    GuidedSolver,
     ModelCoverage,
     PhotoSet,
-    PhotoSolver,
     RefinedStart,
     RefiningSolver,
     Solver,
 )
+from tracking3d.estimation.undistortion import Undistortion
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.components import add_times
@@ -51,6 +48,7 @@ class SessionRefinement:
     _solver: Solver[Any] | None
     _state: Any
     _camera: Camera | None
+    _undistortion: Undistortion
     _settings: IsolatedRuntime
     _presented: FrameOrder
     _refined: bool
@@ -71,7 +69,7 @@ class SessionRefinement:
             RuntimeError: If the solver cannot, see ``can_refine``.
         """
         with self._settings.in_force(), measure("map") as watch:
-            self._state = self._refining().refine(self._state)
+            self._state = self._refining.refine(self._state)
         self.refining += watch.times
         self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
@@ -82,11 +80,10 @@ class SessionRefinement:
         Args:
             confidence: Of the causal estimate of each frame, by index.
         """
-        solver = self._solver
-        if not isinstance(solver, ExtendingSolver) or not self.order_of_time:
+        if not self.can_refine or not self.order_of_time:
             return None
         with self._settings.in_force():
-            begun = solver.begin_extension(self._state, confidence)
+            begun = self._refining.begin_extension(self._state, confidence)
         if begun is None:
             return None
         self._state, explained = begun
@@ -94,10 +91,11 @@ class SessionRefinement:
 
     def extend(self, gap: Gap) -> list[FrameEstimate]:
         """Track the object through a gap, before `refine`; no estimates if a plug-in fails."""
-        assert isinstance(self._solver, ExtendingSolver)
+        view = self._undistortion
+        seen = replace(gap, anchor=view.frame(gap.anchor), frames=view.each(gap.frames))
         try:
             with self._settings.in_force(), measure("map") as watch:
-                self._state, estimates = self._solver.extend(self._state, gap)
+                self._state, estimates = self._refining.extend(self._state, seen)
         except PluginFailure:
             return []
         self.refining += watch.times
@@ -105,9 +103,8 @@ class SessionRefinement:
 
     def end_extension(self, poses: Mapping[int, NDArray[np.float64]], last: int) -> None:
         """Refine the frames of gaps from these poses ``(4, 4)``, by index; ``last`` is the last frame of the video."""
-        assert isinstance(self._solver, ExtendingSolver)
-        self._state = self._solver.end_extension(self._state, set(poses), last)
-        self._state = self._solver.start_from(self._state, poses)
+        self._state = self._refining.end_extension(self._state, set(poses), last)
+        self._state = self._refining.start_from(self._state, poses)
 
     @property
     def first_index(self) -> int:
@@ -130,12 +127,12 @@ class SessionRefinement:
             What it comes to; None if the solver cannot, or a plug-in fails.
         """
         solver, state, first, found = self._solver, None, None, dict[int, FrameEstimate]()
-        if not isinstance(solver, GuidedSolver):
+        if not isinstance(solver, RefiningSolver):
             return None
         order, latest = FrameOrder(0), 0
         try:
             with self._settings.in_force(), measure("map") as watch:
-                for frame, mask in frames:
+                for frame, mask in self._undistortion.each(frames):
                     if first is None:
                         first, order = frame, FrameOrder(frame.index)
                         state, estimate = solver.init(frame, mask)
@@ -156,25 +153,25 @@ class SessionRefinement:
         return Attempt(state, order, poses, confidence)
 
     def lacks_points(self, ended: bool) -> bool:
-        """Whether there is no map with points, and the solver could start from photos; see `PhotoSolver`."""
-        solver = self._solver
-        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+        """Whether there is no map with points, and the solver could start from photos."""
+        if not self.can_refine:
             return False
         with self._settings.in_force():
-            return not solver.has_points(self._state, ended)
+            return not self._refining.has_points(self._state, ended)
 
     def start_from_photos(self, photos: PhotoSet) -> tuple[Attempt | None, str]:
-        """Join the frames as photos, in whatever order; see `PhotoSolver`.
+        """Join the frames as photos, in whatever order; see `RefiningSolver.start_from_photos`.
 
         Returns:
             What it comes to, None if nothing does; and which photos are not joined, in words.
         """
-        solver = self._solver
-        if self.config.object.model is not None or not isinstance(solver, PhotoSolver):
+        if not self.can_refine:
             return None, ""
         try:
             with self._settings.in_force(), measure("map") as watch:
-                state, made = solver.start_from_photos(self._state, photos)
+                read = photos.read
+                seen = replace(photos, read=lambda indices: self._undistortion.each(read(indices)))
+                state, made = self._refining.start_from_photos(self._state, seen)
         except PluginFailure:
             return None, ""
         self.refining += watch.times
@@ -188,9 +185,8 @@ class SessionRefinement:
     def adopt(self, attempt: Attempt) -> None:
         """Continue with another start in place of the first one."""
         self._state, order = attempt.state, attempt.order
-        if isinstance(self._solver, ExtendingSolver):
-            poses = {order.number_of(index): T for index, T in attempt.poses.items()}
-            self._state = self._solver.start_from(self._state, poses)
+        poses = {order.number_of(index): T for index, T in attempt.poses.items()}
+        self._state = self._refining.start_from(self._state, poses)
         self._presented = order
         self._camera = getattr(self._state, "camera", self._camera)
 
@@ -203,27 +199,23 @@ class SessionRefinement:
         Returns:
             Whether that is possible; if not, nothing has changed.
         """
-        solver = self._solver
-        if not isinstance(solver, ContinuingSolver) or self._presented.last is not None:
+        if not self.can_refine or not self.order_of_time:
             return False
         with self._settings.in_force(), measure("map") as watch:
-            state = solver.continue_refinement(self._state, start)
+            state = self._refining.continue_refinement(self._state, start)
         if state is None:
             return False
         self.refining, self._state, self._camera, self._refined = watch.times, state, start.camera, True
         return True
 
     def keyframe_poses(self) -> Mapping[int, NDArray[np.float64]]:
-        """Refined poses ``(4, 4)`` of keyframes after `refine`, see `ContinuingSolver.keyframe_poses`."""
-        if not isinstance(self._solver, ContinuingSolver) or self._presented.last is not None:
-            return {}
-        return self._solver.keyframe_poses(self._state)
+        """Refined poses ``(4, 4)`` of keyframes after `refine`, see `RefiningSolver.keyframe_poses`."""
+        return self._refining.keyframe_poses(self._state) if self.can_refine and self.order_of_time else {}
 
     def keep_frame(self, frame: Frame, T_cam_obj: NDArray[np.float64]) -> None:
         """Take a frame whose refined pose ``(4, 4)`` stands, before the next one is refined."""
-        if isinstance(self._solver, ContinuingSolver):
-            with self._settings.in_force():
-                self._state = self._solver.keep_frame(self._state, frame, T_cam_obj)
+        with self._settings.in_force():
+            self._state = self._refining.keep_frame(self._state, self._undistortion.frame(frame), T_cam_obj)
 
     @contextmanager
     def state_unchanged(self) -> Iterator[None]:
@@ -246,14 +238,15 @@ class SessionRefinement:
             PluginError: If a plug-in fails; the causal estimate then stands, and the next frame may be asked for.
             RuntimeError: Before ``refine``.
         """
-        solver = self._refining()
+        solver = self._refining
         if not self._refined:
             raise RuntimeError("frames are revisited after refine")
         try:
             with self._settings.in_force(), measure("solve") as watch:
-                shown = self._presented.number(frame)
-                self._state, estimate = solver.refine_frame(self._state, shown, mask, T_cam_obj)
-                estimate = self._presented.index(estimate)
+                shown = self._undistortion.frame(self._presented.number(frame))
+                seen = self._undistortion.mask(mask)
+                self._state, estimate = solver.refine_frame(self._state, shown, seen, T_cam_obj)
+                estimate = self._presented.index(self._undistortion.estimate(estimate, mask))
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         estimate = replace(estimate, refined=True)
@@ -263,6 +256,7 @@ class SessionRefinement:
             estimate = mark_failed(estimate, failure)
         return add_times(estimate, watch, frame)
 
+    @property
     def _refining(self) -> RefiningSolver[Any]:
         if not isinstance(self._solver, RefiningSolver):
             raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")

@@ -15,7 +15,7 @@ from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.atlas.atlas import match_landmarks, merge, transform_map
+from tracking3d.estimation.online.atlas import match_landmarks, merge, transform_map
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map

@@ -17,7 +17,7 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.resuming import prompt_record
 from tracking3d.config.models import OnlineConfig, PipelineConfig
-from tracking3d.estimation.online.atlas.atlas import transform_map
+from tracking3d.estimation.online.atlas import transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState

@@ -13,7 +13,7 @@ from online_runs import estimate_of, final
 from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
-from tracking3d.estimation.online.atlas.atlas import (
+from tracking3d.estimation.online.atlas import (
     activate_largest_map,
     colours_match,
     guess_alignment,
@@ -202,7 +202,7 @@ def test_a_map_that_stands_aside_goes_through_the_lens_of_the_end():
     state, _ = run(ALONE)
     before = state.camera
     after = before.zoom(1.2, "solved")
-    other = refine_inactive_map(state.inactive_maps[0], before, after, solver().online)
+    other = refine_inactive_map(state.inactive_maps[0], before, after, solver().options)
     # The first keyframe's pose moves with the lens alone.
     (x, y, z), (u, v, w) = (
         one.object_map.keyframes[0].pose.translation.tolist() for one in (state.inactive_maps[0], other)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from online_runs import solver as waiting_solver
 
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.estimation.online import map_initialization
+from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import try_initialize
+from tracking3d.estimation.online.initialization.pending_frames import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
-from tracking3d.estimation.solver import LiveSolver
+from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.pipeline.session import Session
 from tracking3d.prompts.prompt import make_prompt
 from tracking3d.runtime.background_attempt import BackgroundAttempt
@@ -39,7 +40,7 @@ def held(monkeypatch) -> Iterator[threading.Event]:
             assert released.wait(PATIENCE)
         return state, start
 
-    monkeypatch.setattr(map_initialization, "try_initialize", hold)
+    monkeypatch.setattr(initializer, "try_initialize", hold)
     yield released
     released.set()
 
@@ -71,7 +72,7 @@ def begun_run(frames: int) -> Run:
 
 
 def test_it_is_a_solver_for_live_sources():
-    assert isinstance(waiting_solver(), LiveSolver)
+    assert isinstance(waiting_solver(), RefiningSolver)
     assert solver().in_background and not waiting_solver().in_background
 
 
@@ -121,10 +122,10 @@ def test_nothing_is_kept_of_a_quick_attempt_that_finds_nothing(monkeypatch):
         state: SolverState, config: OnlineConfig, ended: bool = False
     ) -> tuple[SolverState, InitialMap | None]:
         asked.append(len(state.pending or ()))
-        return map_initialization.replace(state, waiting_reason="for a reason", next_attempt=0.5), None
+        return replace(state, waiting_reason="for a reason", next_attempt=0.5), None
 
-    monkeypatch.setattr(map_initialization, "try_initialize", find_nothing)
-    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", PATIENCE)
+    monkeypatch.setattr(initializer, "try_initialize", find_nothing)
+    monkeypatch.setattr(initializer, "_FIRST_WAIT", PATIENCE)
     state, estimates = take(range(4))
     assert asked == [2, 3, 4]
     assert state.background is None and len(state.pending or ()) == 4
@@ -139,9 +140,9 @@ def test_frames_that_come_during_an_attempt_in_vain_are_kept(monkeypatch):
     ) -> tuple[SolverState, InitialMap | None]:
         assert released.wait(PATIENCE)
         assert state.pending is not None
-        return map_initialization.replace(state, pending=state.pending[1:]), None
+        return replace(state, pending=state.pending[1:]), None
 
-    monkeypatch.setattr(map_initialization, "try_initialize", find_nothing_late)
+    monkeypatch.setattr(initializer, "try_initialize", find_nothing_late)
     state, estimates = take(range(5))
     begun = state.background
     assert begun is not None
@@ -156,8 +157,8 @@ def test_an_error_in_the_other_thread_is_raised_in_the_next_frame(monkeypatch):
     def fail(state: SolverState, config: OnlineConfig, ended: bool = False) -> None:
         raise ValueError("something is wrong")
 
-    monkeypatch.setattr(map_initialization, "try_initialize", fail)
-    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", PATIENCE)
+    monkeypatch.setattr(initializer, "try_initialize", fail)
+    monkeypatch.setattr(initializer, "_FIRST_WAIT", PATIENCE)
     with pytest.raises(ValueError, match="something is wrong"):
         take(range(2))
 
@@ -189,8 +190,8 @@ def test_after_an_error_there_is_still_an_object_made_of_the_pending_frames(monk
     def fail(state: SolverState, config: OnlineConfig, ended: bool = False) -> None:
         raise ValueError("something is wrong")
 
-    monkeypatch.setattr(map_initialization, "try_initialize", fail)
-    monkeypatch.setattr(map_initialization, "_FIRST_WAIT", 0.0)
+    monkeypatch.setattr(initializer, "try_initialize", fail)
+    monkeypatch.setattr(initializer, "_FIRST_WAIT", 0.0)
     state, _ = run
     monkeypatch.setattr(
         BackgroundAttempt, "is_done", lambda self, wait=0.0: wait is None and is_done(self, wait)

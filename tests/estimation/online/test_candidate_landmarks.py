@@ -11,8 +11,8 @@ from solid_points import pixels_of
 from turned_solid import CAMERA, turned_map
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping import candidate_landmarks
-from tracking3d.estimation.online.mapping.candidate_landmarks import (
+from tracking3d.estimation.online.mapping import keyframe_insertion
+from tracking3d.estimation.online.mapping.keyframe_insertion import (
     MOST_CANDIDATES,
     is_static_scene,
     promote_candidates,
@@ -105,13 +105,13 @@ def test_a_point_far_from_the_object_is_none_of_it():
 
 
 def test_a_point_without_any_residual_is_dropped_without_a_warning(monkeypatch):
-    adjust = candidate_landmarks.adjust
+    adjust = keyframe_insertion.adjust
 
     def behind(*arguments, **settings):
         found = adjust(*arguments, **settings)
         return replace(found, residual=np.full_like(found.residual, np.nan))
 
-    monkeypatch.setattr(candidate_landmarks, "adjust", behind)
+    monkeypatch.setattr(keyframe_insertion, "adjust", behind)
     assert not shown(recruited(with_tracks(rigid())))
 
 
@@ -154,7 +154,7 @@ def test_candidates_are_corners_beside_the_mask_at_no_known_place(masked):
 
 def test_next_to_an_object_that_rested_a_point_is_promoted_only_after_it_has_turned(monkeypatch):
     """On a table everything moves in the image as the object does, while a hand holds the camera."""
-    monkeypatch.setattr(candidate_landmarks, "_MIN_MOTION", 2.0)  # pixels
+    monkeypatch.setattr(keyframe_insertion, "_MIN_MOTION", 2.0)  # pixels
     little, much = (
         replace(with_tracks(rigid(angles), angles=angles), started_at_rest=True) for angles in (SMALL, ANGLES)
     )

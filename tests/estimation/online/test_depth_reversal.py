@@ -16,9 +16,9 @@ from turned_solid import CAMERA, SIZE, degrees_apart
 from tracking3d.bundle_adjustment.adjustment import reversal_of
 from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online import mapper
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.mapping import depth_reversal as online_reversal
-from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
+from tracking3d.estimation.online.mapper import fix_depth_reversal
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.pose import pose_from_arrays
@@ -109,7 +109,7 @@ def test_many_keyframes_that_show_nothing_new_are_not_tried_again(monkeypatch):
     """Each try costs as much as bundling all of them; without this a long video spent a third of its time on it."""
     tried: list[int] = []
     monkeypatch.setattr(
-        online_reversal,
+        mapper,
         "_better_reversal",
         lambda object_map, camera: tried.append(len(object_map.keyframes)),
     )

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.estimation.online.mapping.candidate_landmarks import dilate_by_ellipse, surroundings
+from tracking3d.estimation.online.mapping.keyframe_insertion import dilate_by_ellipse, surroundings
 
 
 def blobs(seed: int) -> np.ndarray:

@@ -11,9 +11,9 @@ from online_runs import Run, estimate_of, final
 from online_runs import solver as small_solver
 
 from tracking3d.config.models import OnlineConfig
-from tracking3d.estimation.online import first_estimates, map_initialization
+from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import try_initialize
+from tracking3d.estimation.online.initialization.pending_frames import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays
@@ -45,7 +45,7 @@ def late_start(monkeypatch):
         _, start = try_initialize(replace(state, pending=state.pending[:SOLVED]), config, ended=True)
         return state, start
 
-    monkeypatch.setattr(map_initialization, "try_initialize", wait)
+    monkeypatch.setattr(initializer, "try_initialize", wait)
 
 
 def run_clip() -> Run:
@@ -90,7 +90,7 @@ def test_frames_before_those_of_the_start_are_estimated_backwards_in_time(monkey
         later = replace(state, rested=state.pending[:skipped], pending=state.pending[skipped:])
         return try_initialize(later, config, ended=True)
 
-    monkeypatch.setattr(map_initialization, "try_initialize", wait)
+    monkeypatch.setattr(initializer, "try_initialize", wait)
     state, estimates = run_clip()
     assert state.rested == ()
     assert [estimate.index for estimate in estimates] == list(range(FRAMES))
@@ -101,7 +101,7 @@ def test_frames_before_those_of_the_start_are_estimated_backwards_in_time(monkey
 @pytest.mark.usefixtures("late_start")
 def test_without_them_the_last_frame_shows_hardly_a_landmark(monkeypatch):
     """The object turns far enough for the test above to fail if nothing is inserted."""
-    monkeypatch.setattr(first_estimates, "_is_new", lambda *_: False)
+    monkeypatch.setattr(initializer, "_is_new", lambda *_: False)
     state, estimates = run_clip()
     assert state.object_map.keyframes[-1].index == SOLVED - 1
     assert estimates[-1].diagnostics["inliers"] < 5
@@ -128,8 +128,8 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted(monkeypatch):
         (own,) = (view.pose for view in state.object_map.keyframes if view.index == index)
         return pose_from_arrays(R, own.translation.numpy(), state.object_map.vertices)
 
-    monkeypatch.setattr(map_initialization, "try_initialize", without_points)
-    monkeypatch.setattr(map_initialization, "restart_if_misfit", restarted)
+    monkeypatch.setattr(initializer, "try_initialize", without_points)
+    monkeypatch.setattr(initializer, "restart_if_misfit", restarted)
     frames = [Frame(index, image) for index, image in enumerate(clip().images[: again + 2])]
     state, _ = small_solver().init(frames[0], estimate_of(clip().masks[0]))
     answers = []

@@ -9,7 +9,7 @@ import torch
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.observation import mask_box, observe
-from tracking3d.estimation.online.initialization.initializer import image_change
+from tracking3d.estimation.online.initialization.pending_frames import image_change
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window

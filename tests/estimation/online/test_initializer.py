@@ -14,14 +14,14 @@ from turned_solid import CAMERA, SIZE, turned, turned_map
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow
-from tracking3d.estimation.online.initialization import initializer
+from tracking3d.estimation.online.initialization import pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import (
+from tracking3d.estimation.online.initialization.pending_frames import (
     add_pending_frame,
     try_initialize,
     why_no_map,
 )
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
+from tracking3d.estimation.online.masks import initial_estimate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 
@@ -47,8 +47,8 @@ def asked(monkeypatch):
         calls["turning"].append(len(views))
         return [InitialMap(object_map, 0.5, 0.0, "turning", camera)]
 
-    monkeypatch.setattr(initializer, "solve_start", solve_start)
-    monkeypatch.setattr(initializer, "initialize_without_points", by_turning)
+    monkeypatch.setattr(pending_frames, "solve_start", solve_start)
+    monkeypatch.setattr(pending_frames, "initialize_without_points", by_turning)
     return calls
 
 
@@ -189,7 +189,7 @@ def test_an_object_that_was_still_for_long_rests_and_one_that_has_gone_does_not(
 
 def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):
     """A hand that comes, or light, changes the pixels of a thing that stands on a table."""
-    monkeypatch.setattr(initializer, "_last_still_view", lambda views: 0)
+    monkeypatch.setattr(pending_frames, "_last_still_view", lambda views: 0)
     state, start = try_initialize(belief_of([0.0] * 41), CONFIG)
     assert start is None
     assert not asked["turning"]
@@ -300,7 +300,7 @@ def test_a_start_without_points_sees_the_contrast_of_small_marks(monkeypatch):
         seen.extend(len(view.observation.features) for view in views)
         return [InitialMap(object_map, 0.1, 0.0, "turning", camera)]
 
-    monkeypatch.setattr(initializer, "initialize_without_points", start)
+    monkeypatch.setattr(pending_frames, "initialize_without_points", start)
     try_initialize(replace(given, pending=plain, feature_space=space), CONFIG)
     assert set(seen) == {channels + 1}
 
@@ -312,7 +312,7 @@ def test_a_map_without_points_that_misses_its_masks_is_not_accepted(asked, monke
     def missing(object_map, camera, views, weights):
         return [InitialMap(object_map, 0.1, 0.0, "turning", camera, overlap=0.6)]
 
-    monkeypatch.setattr(initializer, "initialize_without_points", missing)
+    monkeypatch.setattr(pending_frames, "initialize_without_points", missing)
     state, start = try_initialize(replace(given, pending=plain), CONFIG)
     assert start is None
     assert "masks" in state.waiting_reason
@@ -328,7 +328,7 @@ def test_starts_from_points_stay_if_the_map_without_points_misses_its_masks(aske
     def missing(object_map, camera, views, weights):
         return [InitialMap(object_map, 0.1, 0.0, "turning", camera, overlap=0.6)]
 
-    monkeypatch.setattr(initializer, "initialize_without_points", missing)
+    monkeypatch.setattr(pending_frames, "initialize_without_points", missing)
     _, start = try_initialize(given, CONFIG, ended=True)
     assert start is not None and start.origin == "points"
 
@@ -336,17 +336,17 @@ def test_starts_from_points_stay_if_the_map_without_points_misses_its_masks(aske
 def test_a_map_that_explains_frames_badly_for_long_is_begun_again_twice_at_most(monkeypatch):
     object_map = replace(turned_map([0.0, 10.0, 20.0]), pointless=True)
     better = replace(object_map, keyframes=object_map.keyframes[:2])
-    monkeypatch.setattr(initializer, "restart_without_points", lambda *_: better)
+    monkeypatch.setattr(pending_frames, "restart_without_points", lambda *_: better)
     state = replace(belief_of(STEADY), pending=None, object_map=object_map, misfits=4, lost_frames=2)
-    assert initializer.restart_if_misfit(state, CONFIG) is state
-    state = initializer.restart_if_misfit(replace(state, misfits=5), CONFIG)
+    assert pending_frames.restart_if_misfit(state, CONFIG) is state
+    state = pending_frames.restart_if_misfit(replace(state, misfits=5), CONFIG)
     assert state.object_map is better
     assert state.last_pose == (better.keyframes[-1].pose, better.keyframes[-1].index)
     assert (state.misfits, state.lost_frames, state.restarts) == (0, 0, 1)
-    state = initializer.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
+    state = pending_frames.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
     assert state.object_map is better
     last = replace(state, misfits=9, object_map=object_map)
-    assert initializer.restart_if_misfit(last, CONFIG) is last
+    assert pending_frames.restart_if_misfit(last, CONFIG) is last
 
 
 def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):
@@ -387,7 +387,7 @@ def test_a_start_waits_while_another_that_turns_otherwise_costs_hardly_more(
     def turned_views(views, sign):
         return tuple(replace(view, pose=turned(sign * 2.0 * place)) for place, view in enumerate(views))
 
-    monkeypatch.setattr(initializer, "solve_start", solve_start)
+    monkeypatch.setattr(pending_frames, "solve_start", solve_start)
     state, start = try_initialize(belief_of([0.0, 3.0, 6.0, 9.0, 12.0]), CONFIG)
     assert (start is not None) is decided
     assert ("two ways" in state.waiting_reason) is not decided
@@ -404,11 +404,11 @@ def test_points_do_not_stay_where_an_object_was_that_has_left(first):
 
 def test_points_that_are_followed_badly_decide_at_once(asked, monkeypatch):
     asked["bundle"] = 0.4
-    monkeypatch.setattr(initializer, "_same_axis", lambda one, other: False)
+    monkeypatch.setattr(pending_frames, "_same_axis", lambda one, other: False)
     turning = map_with_points(STEADY)
-    one = initializer.solve_start(turning, [CAMERA], [], None, 0.0)[0]
-    assert not initializer._is_undecided([one, one], 0.04, None)
-    assert initializer._is_undecided([replace(one, bundle=0.1), one], 0.04, None)
+    one = pending_frames.solve_start(turning, [CAMERA], [], None, 0.0)[0]
+    assert not pending_frames._is_undecided([one, one], 0.04, None)
+    assert pending_frames._is_undecided([replace(one, bundle=0.1), one], 0.04, None)
 
 
 def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatch):
@@ -420,8 +420,8 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
         object_map = map_with_points(STEADY)
         return [InitialMap(object_map, 1.0, bundle, str(len(views)), cameras[0])] * 2
 
-    monkeypatch.setattr(initializer, "solve_start", solve_start)
-    monkeypatch.setattr(initializer, "_same_axis", lambda one, other: False)
+    monkeypatch.setattr(pending_frames, "solve_start", solve_start)
+    monkeypatch.setattr(pending_frames, "_same_axis", lambda one, other: False)
     given = belief_of(STEADY)
     state, start = try_initialize(replace(given, pending=given.pending[:5]), CONFIG)
     assert start is None
@@ -434,9 +434,9 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
 def test_when_no_more_frames_come_the_better_start_is_taken(monkeypatch):
     object_map = map_with_points(STEADY)
     monkeypatch.setattr(
-        initializer, "solve_start", lambda *given: [InitialMap(object_map, 1.0, 0.1, "points", CAMERA)] * 2
+        pending_frames, "solve_start", lambda *given: [InitialMap(object_map, 1.0, 0.1, "points", CAMERA)] * 2
     )
-    monkeypatch.setattr(initializer, "_same_axis", lambda one, other: False)
+    monkeypatch.setattr(pending_frames, "_same_axis", lambda one, other: False)
     state, start = try_initialize(belief_of(STEADY), CONFIG)
     assert start is None
     assert try_initialize(state, CONFIG, ended=True)[1].origin == "points"

@@ -12,13 +12,13 @@ from online_runs import estimate_of, solver
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
+from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
-from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import project_points
+from tracking3d.estimation.online.pose_tracking import resect_pose
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.online.tracking.pose_tracking import resect_pose
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -60,7 +60,7 @@ def disturbed(degrees: float = 2.0) -> SolverState:
 
 def refine(state: SolverState) -> SolverState:
     """With the default settings."""
-    return refine_by_landmarks(state, solver().online)
+    return refine_by_landmarks(state, solver().options)
 
 
 def turned(pose: Pose, degrees: np.ndarray) -> Pose:
@@ -185,7 +185,7 @@ def test_local_mapping_keeps_the_poses_that_landmarks_have_adjusted():
     object_map = replace(object_map, keyframes=tuple(views))
     everything = list(range(len(views)))
     refined = refine_local_map(
-        object_map, clip().camera, everything, solver().online, bundle_iterations=10, rounds=1
+        object_map, clip().camera, everything, solver().options, bundle_iterations=10, rounds=1
     )
     for before, after in zip(views[:-1], refined.keyframes, strict=False):
         assert float(rotation_angle(before.pose.quaternion, after.pose.quaternion)) < 1e-5

@@ -13,9 +13,9 @@ from online_runs import FRAMES, solver, true_mask, turning_clip
 
 from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online import map_initialization
+from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
-from tracking3d.estimation.online.initialization.initializer import try_initialize
+from tracking3d.estimation.online.initialization.pending_frames import try_initialize
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.pipeline.record import record
@@ -63,7 +63,7 @@ def released(monkeypatch) -> Iterator[threading.Event]:
             assert event.wait(PATIENCE)
         return state, start
 
-    monkeypatch.setattr(map_initialization, "try_initialize", hold)
+    monkeypatch.setattr(initializer, "try_initialize", hold)
     yield event
     event.set()
 

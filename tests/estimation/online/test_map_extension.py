@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from online_runs import FRAMES, Run, estimate_of, frame, run, solver, true_mask, turning_clip, with_true_masks
 
-from tracking3d.estimation.online.map_extension import MapExtension
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
@@ -171,7 +170,3 @@ def test_a_second_initialization_that_finds_another_lens_moves_the_lost_map_to_i
 def test_the_same_lens_moves_nothing():
     state = known()[0]
     assert state_through_lens(state, state.camera) is state
-
-
-def test_the_solver_extends_maps():
-    assert isinstance(solver(), MapExtension)

@@ -10,12 +10,12 @@ from online_runs import FRAMES, estimate_of, known_run, true_mask, turning_clip,
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.online.masks.frame_estimates import (
+from tracking3d.estimation.online.masks import (
+    fuse_mask,
     initial_mask_weight,
     mask_agreement,
     measure_mask_agreement,
 )
-from tracking3d.estimation.online.masks.mask_fusion import fuse_mask
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import MaskAgreement
 from tracking3d.features.rgb import RgbEncoder

@@ -9,12 +9,7 @@ from patterns import disc
 
 from tracking3d.estimation.estimate import MaskSource
 from tracking3d.estimation.observation import observe
-from tracking3d.estimation.online.masks.mask_fusion import (
-    fuse_mask,
-    mask_in_window,
-    update_colours,
-    upsampled_window,
-)
+from tracking3d.estimation.online.masks import fuse_mask, mask_in_window, update_colours, upsampled_window
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window

@@ -9,8 +9,8 @@ import pytest
 import torch
 from rendered_solids import pose_of
 
+from tracking3d.estimation.online.pose_tracking import is_consistent_with_motion, pose_predictions
 from tracking3d.estimation.online.state.solver_state import SolverPhase
-from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion, pose_predictions
 from tracking3d.geometry.camera import Camera
 
 

@@ -10,8 +10,8 @@ import pytest
 from online_runs import FRAMES, known_run
 from solid_points import map_with_points
 
-from tracking3d.estimation.online.masks import mask_fusion
-from tracking3d.estimation.online.masks.mask_fusion import (
+from tracking3d.estimation.online import masks
+from tracking3d.estimation.online.masks import (
     is_seen_again,
     mask_in_window,
     motion_cue_in_window,
@@ -27,14 +27,14 @@ def state(monkeypatch):
     """A belief of a box that turns; everything moves along."""
     updated = known_run(FRAMES)[0]  # other tests have the same run: it is solved before anything is replaced
     monkeypatch.setattr(
-        mask_fusion,
+        masks,
         "online_motion_log_odds",
         lambda here, earlier, window, *object_: np.ones((window.size,) * 2, np.float32),
     )
     return updated
 
 
-def found(state, mask=None, inliers=mask_fusion._MIN_INLIERS, lost=False) -> SimpleNamespace:
+def found(state, mask=None, inliers=masks._MIN_INLIERS, lost=False) -> SimpleNamespace:
     """The last keyframe found where it is."""
     view = state.object_map.keyframes[-1]
     view = replace(view, mask=view.mask if mask is None else mask)
@@ -53,7 +53,7 @@ def test_a_pose_that_points_agree_with_tells_what_moves_along(state):
 
 def test_others_do_not(state):
     assert motion_cue_in_window(state, found(state, lost=True), IMAGE) is None
-    assert motion_cue_in_window(state, found(state, inliers=mask_fusion._MIN_INLIERS - 1), IMAGE) is None
+    assert motion_cue_in_window(state, found(state, inliers=masks._MIN_INLIERS - 1), IMAGE) is None
     assert motion_cue_in_window(replace(state, motion_references=()), found(state), IMAGE) is None
 
 
@@ -66,7 +66,7 @@ def test_nothing_is_asked_at_the_border_and_of_a_still_scene(state):
 
 
 def test_of_a_side_that_comes_again_nothing_beside_is_new(state, monkeypatch):
-    monkeypatch.setattr(mask_fusion, "is_seen_again", lambda object_map, pose: True)
+    monkeypatch.setattr(masks, "is_seen_again", lambda object_map, pose: True)
     seen = found(state)
     told = motion_cue_in_window(state, seen, IMAGE)
     window, _ = upsampled_window(seen.view.observation)
@@ -79,7 +79,7 @@ def test_of_a_side_that_comes_again_nothing_beside_is_new(state, monkeypatch):
 def test_frames_are_remembered_while_they_are_believed(state):
     estimate = known_run(FRAMES)[1][-1]
     after = remember_motion(state, estimate, found(state), IMAGE)
-    assert after.motion_references[:-1] == state.motion_references[-mask_fusion._MAX_REFERENCES + 1 :]
+    assert after.motion_references[:-1] == state.motion_references[-masks._MAX_REFERENCES + 1 :]
     assert remember_motion(state, estimate, found(state, inliers=0), IMAGE) is state
     assert not remember_motion(state, estimate, found(state, lost=True), IMAGE).motion_references
 

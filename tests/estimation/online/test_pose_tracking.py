@@ -13,15 +13,15 @@ from turned_solid import CAMERA, degrees_apart, turned, turned_map
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.optimization.pose_refinement import render_cost
 from tracking3d.estimation.online.optimization.types import PoseWeights
-from tracking3d.estimation.online.relocalization.pose_search import aligned_keyframes, search_rotations
-from tracking3d.estimation.online.tracking.motion_model import extrapolate_motion
-from tracking3d.estimation.online.tracking.pose_tracking import (
+from tracking3d.estimation.online.pose_tracking import (
     count_inliers,
+    extrapolate_motion,
     find_inliers,
     fit_pose,
     pixel_scale,
     pose_of_points,
 )
+from tracking3d.estimation.online.relocalization import aligned_keyframes, search_rotations
 from tracking3d.geometry.pose import Pose
 
 ANGLES = [-10.0, 0.0, 10.0]

@@ -10,7 +10,7 @@ from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_ma
 
 from tracking3d.estimation.estimate import RELOCALIZED, MaskSource, Status, corrects
 from tracking3d.estimation.online.features.klt import grey
-from tracking3d.estimation.online.relocalization.pose_search import overlaps_mask, relocalize_in_frame
+from tracking3d.estimation.online.relocalization import overlaps_mask, relocalize_in_frame
 from tracking3d.frames import Frame
 from tracking3d_bench.evaluation.metrics import mask_iou
 

@@ -1,93 +1,107 @@
 """The online solver: track fast, map when it pays, and join matched points with re-rendering.
 
-The loop, frame by frame; the rooms beside this module hold its steps::
-
-    if phase is INITIALIZING:                  # initialization/
-        add the frame to the pending ones
-        if they show enough motion: make the first map, and estimate all pending frames again
-    else:                                      # frame_tracker
-        predict the pose by the motion model   # tracking/
-        refine it by appearance, outline and tracked points
-        if the losses are unusual: relocalize  # relocalization/
-        assess the pose, fuse the mask         # state/confidence, masks/
-        if the frame is a keyframe:            # mapping/
-            insert it, refine the local map, check for a depth reversal
-            merge the maps that show the same side  # atlas/
-    if phase is LOST:                          # atlas/
-        try the inactive maps, else collect frames for a second map
+`OnlineSolver.step` is the loop, frame by frame. Its parts do not know one another: `initializer` makes the first map,
+`tracker` finds a pose, `mapper` inserts keyframes, `atlas` holds several maps, `refiner` ends a video. What they are
+made of stands in the rooms beside them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
-from tracking3d.estimation.online.atlas.atlas import (
-    activate_largest_map,
-    activate_map,
-    colours_match,
-    guess_alignment,
-    is_fully_visible,
-    is_reliable,
-    map_of_frame,
-    mark_unaligned,
-    masks_overlap,
-    merge_maps,
-    needs_second_map,
-    refine_inactive_map,
-    switch_map,
-    transform_estimates,
-)
+from tracking3d.estimation.observation import Observer
+from tracking3d.estimation.online import atlas, refiner
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.initialization.initial_map import restart_without_points
-from tracking3d.estimation.online.initialization.initializer import (
-    try_initialize,
-    why_no_map,
-)
-from tracking3d.estimation.online.initialization.photo_start import (
-    MOST_PHOTOS,
-    initial_map_of_photos,
-    start_of_photos,
-)
-from tracking3d.estimation.online.initialization.photo_tracks import Photo
-from tracking3d.estimation.online.map_initialization import MapInitialization
+from tracking3d.estimation.online.initializer import Initializer
+from tracking3d.estimation.online.mapper import insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
-from tracking3d.estimation.online.mapping.global_refinement import refine_globally
-from tracking3d.estimation.online.mapping.keyframe_insertion import cut_around_object, insert_points
-from tracking3d.estimation.online.mapping.object_model import object_model
-from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, make_estimate, mask_agreement
-from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.relocalization.pose_search import poses_from_matches, should_retry
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
-from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import (
-    TRAJECTORY_LENGTH,
-    advance,
-    pose_predictions,
+from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, view_frame
+from tracking3d.estimation.online.masks import (
+    initial_estimate,
+    learn_colours,
+    make_estimate,
+    mask_agreement,
+    measure_mask_agreement,
+    motion_cue_in_window,
+    remember_motion,
 )
-from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale
-from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
-from tracking3d.estimation.shape import Shape, first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.estimation.solver import STATE_CLASSES, PhotoEstimates, PhotoSet
-from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
+from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.pose_tracking import (
+    advance,
+    extend_trajectory,
+    extrapolate_motion,
+    pose_predictions,
+    resect_pose,
+)
+from tracking3d.estimation.online.relocalization import should_retry
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, is_high_loss, is_misfit
+from tracking3d.estimation.online.state.solver_state import (
+    ONLINE_CLASSES,
+    SolverPhase,
+    SolverState,
+    thin_out,
+)
+from tracking3d.estimation.online.tracker import Tracker
+from tracking3d.estimation.shape import first_mask
+from tracking3d.estimation.solver import (
+    STATE_CLASSES,
+    Gap,
+    ModelCoverage,
+    PhotoEstimates,
+    PhotoSet,
+    RefinedStart,
+)
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, pose_from_arrays
-from tracking3d.rendering import TexelMap
+from tracking3d.geometry.pose import pose_from_arrays
+from tracking3d.runtime.stage_times import in_stage
+
+_MIN_MASK_IOU = 0.3
+"""IoU of the last pose's silhouette with a correct mask, below which the last pose is discarded."""
 
 
 @dataclass(frozen=True)
-class OnlineSolver(MapInitialization):
-    """The solver `online`; implements all protocols of `tracking3d.estimation.solver`."""
+class OnlineSolver:
+    """The solver `online`; implements `tracking3d.estimation.solver.RefiningSolver`."""
+
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame
+    encoder: FeatureEncoder  # the feature encoder
+    # whether the first map is computed in another thread; the result then depends on the machine
+    in_background: bool = field(default=False, kw_only=True)
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """The classes that a `SolverState` consists of, for checkpoints."""
+
+    @property
+    def options(self) -> OnlineConfig:
+        """The solver's own part of the configuration."""
+        assert isinstance(self.config.solver, OnlineConfig)
+        return self.config.solver
+
+    @cached_property
+    def observer(self) -> Observer:
+        """How a frame becomes an observation."""
+        return Observer(self.config, self.camera, self.encoder)
+
+    @cached_property
+    def initializer(self) -> Initializer:
+        """Makes the first map."""
+        return Initializer(self.observer, self.options, self.in_background)
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """Finds the pose in a frame."""
+        return Tracker(self.observer, PoseWeights.of(self.options))
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take the first frame, with the prototype as the shape.
@@ -95,102 +109,135 @@ class OnlineSolver(MapInitialization):
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        return self._first_state(mask.on(frame), first_mask(frame, mask), self.camera)
-
-    def _first_state(
-        self, frame: Frame, binary: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
-    ) -> tuple[SolverState, FrameEstimate]:
-        """The state after a first frame; ``space`` is the feature space, if there is one already."""
-        ellipse = mask_ellipse(binary)
-        translation = torch.tensor(first_translation(ellipse, camera), dtype=torch.float32)
-        pose = Pose.identity(translation.to(self.device))
-        shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
-        texels = TexelMap.of(shape.face_uvs, self.config.object.texture_size)
-        object_map = ObjectMap(
-            shape,
-            texels,
-            shape.rest,
-            np.zeros((0, 3)),
-            (),
-            np.zeros(0, bool),
-            renderer=self.config.runtime.renderer,
-        )
-        image = grey(frame.image)
-        state = SolverState(camera, object_map, None, (pose, frame.index), None, image, FollowedPoints.none())
-        observation = self._observe(state, frame, binary, pose)
-        if space is None:
-            channels = feature_channels(self.encoder, self.config.object.texture_channels)
-            space = FeatureSpace.of(observation.features, observation.mask, channels)
-        observation = replace(observation, features=space.project(observation.features, observation.image))
-        window = cut_around_object(object_map, camera, frame.image, binary, pose)
-        view = Keyframe(observation, binary, pose, FollowedPoints.none(), image=window)
-        object_map, view = insert_points(object_map, camera, view, image)
-        estimate = initial_estimate(frame, binary, pose, camera)
-        state = replace(
-            state,
-            object_map=object_map,
-            feature_space=space,
-            tracked_points=view.points,
-            pending=((view, estimate),),
-        )
-        return state, estimate
+        return self.initializer.begin(mask.on(frame), first_mask(frame, mask), self.camera)
 
     def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
         frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         if state.phase is SolverPhase.INITIALIZING:
-            return self._add_pending(state, frame, image, binary)
-        state, revised = self._restart_if_misfit(state)
-        state, estimate = self._track(state, frame, image, binary)
-        if binary is not None and needs_second_map(state, image, binary):
-            state, estimate = self._recover(state, estimate, frame, binary)
+            return self.initializer.add(state, frame, image, binary)
+        state, revised = self.initializer.restart_if_misfit(state)
+        state, estimate = self._track(state, frame, image, binary, self.options)
+        if binary is not None and atlas.needs_second_map(state, image, binary):
+            state, estimate = self._recover(state, estimate, frame, image, binary)
         estimate = replace(estimate, revised=(*revised, *estimate.revised))
-        return state, mark_unaligned(estimate) if state.unaligned else estimate
+        return state, atlas.mark_unaligned(estimate) if state.unaligned else estimate
 
-    restart_backwards = staticmethod(restart_backwards)
-    trust_mask = staticmethod(trust_mask)
+    def _track(
+        self,
+        state: SolverState,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        mask: NDArray[np.bool_] | None,
+        options: OnlineConfig,
+    ) -> tuple[SolverState, FrameEstimate]:
+        """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
+        found = self.tracker.track(state, frame, image, mask)
+        usual = not (found.lost or is_high_loss(found.fit, state.baseline, found.view.mask_weight))
+        reliable = usual or (not found.lost and found.evidence.is_decisive)
+        is_keyframe = reliable and needs_keyframe(state.object_map, found, options)
+        pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
+        updated = advance(state, found, pose, image)
+        if usual:
+            updated = replace(updated, baseline=state.baseline.update(found.fit))
+        if state.object_map.pointless:
+            misfit = is_misfit(found.fit, state.baseline)
+            updated = replace(updated, misfits=state.misfits + 1 if misfit else 0)
+        if is_keyframe:
+            with in_stage("map"):
+                view = replace(found.view, pose=pose, points=found.points)
+                updated = insert_frame(updated, view, image, options)
+                updated = atlas.merge_maps(updated, options, updated.object_map.keyframes[-1:])
+                if self.config.has_given_masks:
+                    updated = measure_mask_agreement(updated)
+            pose = updated.last_pose[0]
+        if found.lost:
+            updated = replace(updated, previous_pose=None)
+        elif usual:
+            updated = extend_trajectory(updated, pose, frame.index)
+        found = replace(found, fit=replace(found.fit, pose=pose))
+        plain, now = initial_estimate(frame, mask, pose, state.camera), updated
+        estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
+        updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
+        if state.revisable:
+            updated = replace(updated, revisable=thin_out((*state.revisable, (found.view, plain))))
+        if not (found.doubtful if state.object_map.pointless else found.lost):
+            updated = replace(updated, reinitialization=None)
+        if not (found.lost or is_keyframe):
+            # Only what is reported: masks and map follow the pose that fits this surface and these outlines.
+            pose = resect_pose(state.object_map, state.camera, found.view, pose)
+            estimate = replace(estimate, T_cam_obj=pose.matrix().numpy())
+        return updated, replace(estimate, keyframe=is_keyframe)
+
+    def _recover(
+        self,
+        state: SolverState,
+        estimate: FrameEstimate,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        mask: NDArray[np.bool_],
+    ) -> tuple[SolverState, FrameEstimate]:
+        """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
+
+        Args:
+            state: After the frame, in which the object is lost.
+            estimate: Of the frame.
+            frame: The frame.
+            image: ``(H, W)`` grey.
+            mask: ``(H, W)`` its initial mask.
+        """
+        searched = state.phase is SolverPhase.LOST and should_retry(state.lost_frames)
+        for other in state.inactive_maps if searched else ():
+            other_state = atlas.activate_map(state, other, frame.index)
+            updated, found = self._track(other_state, frame, image, mask, self.options)
+            if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
+                return updated, found
+        begun, last = state.reinitialization, None
+        if begun is not None and begun.pending:
+            last = begun.pending[-1][0].mask
+        if begun is None or not atlas.masks_overlap(last, mask):
+            if not atlas.is_fully_visible(mask) or not atlas.colours_match(state, frame, mask):
+                return replace(state, reinitialization=None), estimate
+            second, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
+            return replace(state, reinitialization=second), estimate
+        begun, again = self.initializer.add(begun, frame, image, mask)
+        if begun.phase is SolverPhase.INITIALIZING:
+            return replace(state, reinitialization=begun), estimate
+        if not atlas.is_reliable(begun, again):
+            return replace(state, reinitialization=None), estimate
+        state = state_through_lens(state, begun.camera)
+        similarity = atlas.guess_alignment(state, begun)
+        switched = atlas.switch_map(state, begun, similarity)
+        again = atlas.transform_estimates(again, similarity, state.camera)
+        if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
+            return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
+        return switched, atlas.mark_unaligned(again)
 
     def refine(self, state: SolverState) -> SolverState:
         """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
         state, _ = self.finish_background_work(state)
         if state.phase is SolverPhase.INITIALIZING:
-            state, start = try_initialize(state, self.online, ended=True)
-            if start is None:
-                return replace(state, waiting_reason=why_no_map(state))
-            state, _ = self._initialize(state, start)
-        state = merge_maps(state, self.online, state.object_map.keyframes)
-        state = activate_largest_map(
+            state = self.initializer.finish(state)
+        if state.phase is SolverPhase.INITIALIZING:
+            return state
+        state = atlas.merge_maps(state, self.options, state.object_map.keyframes)
+        state = atlas.activate_largest_map(
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
         )
-        object_map, camera = state.object_map, state.camera
-        if object_map.pointless and not object_map.fixed_keyframes:
-            object_map = restart_without_points(
-                object_map, camera, FitWeights(smoothness=self.online.smoothness)
-            )
-        object_map, camera = refine_globally(object_map, camera, self.online)
+        before, state = state.camera, refiner.refine_active_map(state, self.options)
         if self.config.has_given_masks:
-            state = replace(state, mask_agreement=mask_agreement(object_map, camera))
-        return replace(
-            state,
-            inactive_maps=tuple(
-                refine_inactive_map(other, state.camera, camera, self.online) for other in state.inactive_maps
-            ),
-            unaligned=False,
-            camera=camera,
-            object_map=object_map,
-            surface=object_map.surface(),
-            previous_pose=None,
-            lost_frames=0,
-            doubtful_frames=0,
-            trajectory=state.trajectory and ((object_map.keyframes[0].pose, object_map.keyframes[0].index),),
-            tracked_points=FollowedPoints.none(),
+            state = replace(state, mask_agreement=mask_agreement(state.object_map, state.camera))
+        others = (
+            atlas.refine_inactive_map(other, before, state.camera, self.options)
+            for other in state.inactive_maps
         )
+        return replace(state, inactive_maps=tuple(others))
 
     def refine_frame(
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[SolverState, FrameEstimate]:
         """Estimate a frame's pose again, with the final map."""
-        state, frame = map_of_frame(state, frame.index), mask.on(frame)
+        state, frame = atlas.map_of_frame(state, frame.index), mask.on(frame)
         binary, image, object_map = mask.found, grey(frame.image), state.object_map
         T_cam_obj = state.extended.get(frame.index, T_cam_obj)
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
@@ -205,118 +252,130 @@ class OnlineSolver(MapInitialization):
             followed = own.points.concatenate(followed)
         if state.previous_pose is not None:
             starts |= pose_predictions(state, frame.index, binary)
-        found = self._find(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
+        view = view_frame(self.observer, state, frame, binary, causal, followed)
+        found = self.tracker.find(state, view, frame, image, starts)
         before = state.last_pose if state.last_pose[1] == frame.index - 1 else None
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
-        if not found.lost:
-            updated = replace(
-                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-TRAJECTORY_LENGTH:]
-            )
         if found.lost:  # no better pose than the causal one was found
             found = replace(found, fit=replace(found.fit, pose=causal))
+        else:
+            updated = extend_trajectory(updated, found.fit.pose, frame.index)
         estimate = make_estimate(
             updated, initial_estimate(frame, binary, found.fit.pose, state.camera), found
         )
-        return updated, replace(mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
-
-    def has_points(self, state: SolverState, ended: bool) -> bool:
-        """See `tracking3d.estimation.solver.PhotoSolver`."""
-        if state.phase is SolverPhase.INITIALIZING:
-            start = try_initialize(state, self.online, ended=True)[1] if ended else None
-            return start is not None and not start.object_map.pointless
-        maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
-        return not all(one.pointless for one in maps)
-
-    def start_from_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
-        """See `tracking3d.estimation.solver.PhotoSolver`."""
-        places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
-        chosen = [photos.indices[place] for place in places.round().astype(int)]
-        begun: SolverState | None = None
-        found, waiting = list[Photo](), list[tuple[Keyframe, FrameEstimate]]()
-        for frame, mask in photos.read(chosen):
-            frame, binary = mask.on(frame), mask.found
-            if binary is None:
-                continue
-            if begun is None:
-                space = state.feature_space and replace(state.feature_space, contrast=0.0)
-                begun, _ = self._first_state(frame, binary, self.camera, space)
-            depth = first_translation(mask_ellipse(binary), self.camera)
-            pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=self.device))
-            view = self._view(begun, frame, binary, pose, FollowedPoints.none())
-            waiting.append((view, initial_estimate(frame, binary, pose, self.camera)))
-            found.append(Photo.of(frame.index, grey(frame.image), binary))
-        start = start_of_photos(found, self.camera)
-        if begun is None or start.structure is None:
-            return replace(state, waiting_reason=start.reason), PhotoEstimates((), start.reason)
-        weights = FitWeights(smoothness=self.online.smoothness)
-        views = [view for view, _ in waiting]
-        made, shown = initial_map_of_photos(begun.object_map, start, found, views, self.camera, weights)
-        pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
-        begun, last = self._initialize(replace(begun, pending=pending), made)
-        estimates = [*last.revised, replace(last, revised=())]
-        rest = sorted(set(photos.indices) - set(chosen))
-        estimates += [
-            self._find_photo(begun, frame, mask) for frame, mask in (photos.read(rest) if rest else ())
-        ]
-        return begun, PhotoEstimates(tuple(estimates), start.reason)
-
-    def _find_photo(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
-        """A photo that was not joined, by its matches with the nearest ones that were; lost if there are too few."""
-        pose, binary = state.last_pose[0], mask.found
-        nearest = sorted(state.object_map.keyframes, key=lambda view: abs(view.index - frame.index))
-        matched = []
-        if binary is not None:
-            [keypoints] = Photo.of(frame.index, grey(frame.image), binary).keypoints
-            scale = pixel_scale(nearest[0])
-            matched = poses_from_matches(state.object_map, state.camera, keypoints, nearest[:4], scale)
-        estimate = initial_estimate(frame, binary, matched[0][0] if matched else pose, state.camera)
-        decisive = bool(matched) and len(matched[0][1]) >= ENOUGH_POINTS
-        return replace(estimate, confidence=TRACKED_CONFIDENCE if decisive else 0.0)
+        return updated, replace(atlas.mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
 
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
         state, _ = self.finish_background_work(state)
         if state.inactive_maps:
-            state = activate_largest_map(state)
+            state = atlas.activate_largest_map(state)
         object_map = state.object_map
         if not object_map.keyframes:
             object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
-        return object_model(object_map, state.surface or object_map.surface())
+        return object_map.model(state.surface or object_map.surface())
 
-    def _recover(
-        self, state: SolverState, estimate: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
-    ) -> tuple[SolverState, FrameEstimate]:
-        """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
+    def continue_refinement(self, state: SolverState, start: RefinedStart) -> SolverState | None:
+        """See `tracking3d.estimation.solver.RefiningSolver`."""
+        return refiner.continue_refinement(state, start, self.options)
+
+    keep_frame = staticmethod(refiner.keep_frame)
+    keyframe_poses = staticmethod(refiner.keyframe_poses)
+
+    def begin_extension(
+        self, state: SolverState, confidence: Mapping[int, float]
+    ) -> tuple[SolverState, ModelCoverage] | None:
+        """The state with the largest map active, and what it explains; None if it cannot be extended."""
+        if state.phase is SolverPhase.INITIALIZING:
+            return None
+        last = state.last_pose[1]
+        spans = (*state.spans, (state.active_since, last))
+        state = atlas.activate_largest_map(replace(state, spans=spans, active_since=last + 1))
+        own = {index: confidence[index] for index in atlas.frames_of_map(state, confidence)}
+        return refiner.prepare_extension(state, own, self.options)
+
+    def extend(self, state: SolverState, gap: Gap) -> tuple[SolverState, list[FrameEstimate]]:
+        """Track the object through a gap, and insert keyframes there; no estimates if its keyframe was culled."""
+        if all(view.index != gap.anchor.index for view in state.object_map.keyframes):
+            return state, []
+        aside, options = state.inactive_maps, refiner.with_more_keyframes(self.options)
+        number = max(state.last_pose[1], *(view.index for view in state.object_map.keyframes)) + 1
+        state, estimates = refiner.enter_gap(state, gap, number), list[FrameEstimate]()
+        for frame, mask in gap.frames:
+            shown = replace(frame, index=number + abs(frame.index - gap.anchor.index))
+            state, estimate = self._track(state, shown, grey(frame.image), mask.found, options)
+            estimates.append(replace(estimate, index=frame.index))
+        return replace(refiner.leave_gap(state, gap, number), inactive_maps=aside), estimates
+
+    end_extension = staticmethod(refiner.end_extension)
+
+    def start_from(self, state: SolverState, poses: Mapping[int, NDArray[np.float64]]) -> SolverState:
+        """The state that refines frames from other poses than the causal ones."""
+        return replace(state, extended=dict(poses))
+
+    def has_points(self, state: SolverState, ended: bool) -> bool:
+        """See `tracking3d.estimation.solver.RefiningSolver`."""
+        return self.initializer.has_points(state, ended)
+
+    def start_from_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
+        """See `tracking3d.estimation.solver.RefiningSolver`."""
+        return self.initializer.join_photos(state, photos)
+
+    def for_live_source(self) -> Self:
+        """The solver for a source that does not wait; see `tracking3d.estimation.solver.RefiningSolver`."""
+        return replace(self, in_background=True)
+
+    def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """See `tracking3d.estimation.solver.RefiningSolver`."""
+        return self.initializer.finish_background_work(state)
+
+    @staticmethod
+    def restart_backwards(
+        state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
+    ) -> SolverState:
+        """The state that continues from an earlier frame, with everything learnt since.
 
         Args:
-            state: After the frame, in which the object is lost.
-            estimate: Of the frame.
-            frame: The frame.
-            mask: ``(H, W)`` its initial mask.
+            state: The state after the last frame.
+            frame: The frame to continue from.
+            number: The index of the last frame; the next one's follows it.
+            T_cam_obj: ``(4, 4)`` the frame's estimate, used if the frame is no keyframe.
         """
-        image = grey(frame.image)
-        searched = state.phase is SolverPhase.LOST and should_retry(state.lost_frames)
-        for other in state.inactive_maps if searched else ():
-            updated, found = self._track(activate_map(state, other, frame.index), frame, image, mask)
-            if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
-                return updated, found
-        begun, last = state.reinitialization, None
-        if begun is not None and begun.pending:
-            last = begun.pending[-1][0].mask
-        if begun is None or not masks_overlap(last, mask):
-            if not is_fully_visible(mask) or not colours_match(state, frame, mask):
-                return replace(state, reinitialization=None), estimate
-            second = self._first_state(frame, mask, state.camera, state.feature_space)[0]
-            return replace(state, reinitialization=second), estimate
-        begun, again = self._add_pending(begun, frame, image, mask)
-        if begun.phase is SolverPhase.INITIALIZING:
-            return replace(state, reinitialization=begun), estimate
-        if not is_reliable(begun, again):
-            return replace(state, reinitialization=None), estimate
-        state = state_through_lens(state, begun.camera)
-        similarity = guess_alignment(state, begun)
-        switched = switch_map(state, begun, similarity)
-        again = transform_estimates(again, similarity, state.camera)
-        if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
-            return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
-        return switched, mark_unaligned(again)
+        views = [*state.object_map.keyframes, *(view for view, _ in state.pending or ())]
+        own = next((view for view in views if view.index == frame.index), None)
+        pose = (
+            pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], state.object_map.vertices)
+            if own is None
+            else own.pose
+        )
+        return replace(
+            state,
+            last_pose=(pose, number),
+            reinitialization=None,
+            previous_pose=None,
+            grey=grey(frame.image),
+            tracked_points=FollowedPoints.none() if own is None else own.points,
+            lost_frames=0,
+            doubtful_frames=0,
+            trajectory=((pose, number),) if state.pending is None else (),
+            motion_references=(),
+        )
+
+    @staticmethod
+    def trust_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> SolverState:
+        """The state before a frame whose mask ``(H, W)`` is correct: tracked points that leave the mask are dropped.
+
+        Without inliers against it the mask has full weight. If the last pose is elsewhere, the object was lost
+        unnoticed: all of its sides are then tried at the mask.
+        """
+        if state.phase is not SolverPhase.INITIALIZING:
+            rendered = state.object_map.silhouette(state.last_pose[0], state.camera)
+            if np.count_nonzero(rendered & mask) < _MIN_MASK_IOU * np.count_nonzero(rendered | mask):
+                state = replace(state, lost_frames=max(state.lost_frames, 1))
+        if not len(state.tracked_points):
+            return state
+        here = follow(state.grey, grey(frame.image), state.tracked_points)
+        x, y = np.rint(here.pixel).astype(int).T
+        inside = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+        stay = np.isin(state.tracked_points.landmark, here.landmark[inside])
+        return replace(state, tracked_points=state.tracked_points.only(stay))

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.config.models import KeyframeConfig, PaperConfig
+from tracking3d.config.models import KeyframeConfig, PaperConfig, PipelineConfig
 from tracking3d.estimation.estimate import Assessment, FrameEstimate, MaskSource, ObjectModel, Status, assess
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.observation import Observation, ObservationBatch, downsample
+from tracking3d.estimation.observation import Observation, ObservationBatch, Observer, downsample
 from tracking3d.estimation.paper.problem import Optimum, Parameters, Problem, optimize
-from tracking3d.estimation.paper.state import PaperState, PosedObservation
 from tracking3d.estimation.shape import (
     Shape,
     first_mask,
@@ -33,20 +32,108 @@ from tracking3d.estimation.shape import (
     visible_texture,
 )
 from tracking3d.estimation.solver import STATE_CLASSES
-from tracking3d.estimation.solver_base import SolverBase
+from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.geometry.camera import NEAR
+from tracking3d.geometry.camera import NEAR, Camera
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_angle, rotation_exponential
-from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.rendering import BackProjection, TexelMap, back_project, project, rasterize
 from tracking3d.runtime.stage_times import in_stage
 
 
+@dataclass(frozen=True, eq=False)
+class PosedObservation:
+    """A frame that stays in the optimization, with its pose as it stands."""
+
+    observation: Observation
+    pose: Pose
+
+
+@dataclass(frozen=True, eq=False)
+class PaperState:
+    """What the solver knows."""
+
+    camera: Camera  # the camera of the video
+    shape: Shape  # the fixed part of the object
+    texels: TexelMap  # where each texel lies on the surface
+    offsets: Tensor  # (V, 3) vertex offsets from the prototype
+    texture: Tensor  # (C, T, T) feature texture
+    keyframes: tuple[PosedObservation, ...]  # in order of time
+    seen: BackProjection  # RGB that former keyframes showed of each texel
+    last: tuple[Pose, int]  # pose and index of the last frame, a lost one's included
+    # the same of the frame before that one; None if there is no motion to go on with
+    before: tuple[Pose, int] | None = None
+    # first frames that wait for the joint start, with their answers so far; None when none waits any more
+    waiting: tuple[tuple[PosedObservation, FrameEstimate], ...] | None = None
+    started: bool = False  # whether the first frame is done
+    space: FeatureSpace | None = None  # what is made of the encoder's features; None leaves them as they are
+    renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
+
+    @property
+    def vertices(self) -> Tensor:
+        """``(V, 3)`` in object coordinates."""
+        return self.shape.rest + self.offsets
+
+    @property
+    def object_size(self) -> float:
+        """Diameter of the object in object units."""
+        centred = self.vertices - self.vertices.mean(0)
+        return 2 * float(centred.norm(dim=1).max())
+
+    def moved(self, pose: Pose, index: int) -> PaperState:
+        """The same state one frame later."""
+        return replace(self, last=(pose, index), before=self.last if self.started else None, started=True)
+
+    def back_project(self, values: Tensor, keyframe: PosedObservation) -> BackProjection:
+        """What a frame shows of the texture; ``values`` is ``(C, H, W)`` over the frame's window."""
+        observation = keyframe.observation
+        scale = values.shape[-1] / observation.window.size
+        K = observation.K.clone()
+        K[:2] *= scale
+        K[:2, 2] += (scale - 1) / 2  # pixel centres stay at integers
+        valid = observation.valid * (observation.mask if observation.has_mask else 1.0)
+        valid = torch.nn.functional.interpolate(valid[None, None], size=values.shape[-2:], mode="bilinear")[
+            0, 0
+        ]
+        return back_project(
+            values, valid, self.vertices, self.shape.faces, self.texels, keyframe.pose.R,
+            keyframe.pose.translation, K, self.renderer,
+        )  # fmt: skip
+
+    def visible_texture_of_keyframes(self) -> BackProjection:
+        """RGB seen of each texel, the present keyframes included."""
+        seen = self.seen
+        for keyframe in self.keyframes:
+            seen = seen + self.back_project(keyframe.observation.image, keyframe)
+        return seen
+
+    def silhouette(self, pose: Pose) -> NDArray[np.bool_]:
+        """Hard silhouette ``(H, W)`` in the full frame."""
+        size = (self.camera.height, self.camera.width)
+        K = torch.tensor(self.camera.K, dtype=torch.float32, device=self.offsets.device)
+        screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
+        covered = rasterize(screen, depth, self.shape.faces, size, self.renderer).face_index[0] >= 0
+        return np.asarray(covered.cpu().numpy(), dtype=np.bool_)
+
+    def parameters(self, frames: list[PosedObservation]) -> Parameters:
+        """Poses of the frames, with the shape and texture as they are."""
+        poses = Pose.stack([frame.pose for frame in frames])
+        return Parameters(poses.translation, poses.quaternion, self.offsets, self.texture)
+
+
 @dataclass(frozen=True)
-class PaperSolver(SolverBase):
+class PaperSolver:
     """See the module; implements `tracking3d.estimation.solver.Solver`."""
+
+    config: PipelineConfig  # the pipeline's configuration
+    camera: Camera  # the camera of the full frame
+    encoder: FeatureEncoder  # the feature encoder
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, PaperState, PosedObservation)
     """What a `PaperState` is made of, for keeping it."""
+
+    @property
+    def _observer(self) -> Observer:
+        return Observer(self.config, self.camera, self.encoder)
 
     @property
     def settings(self) -> PaperConfig:
@@ -73,10 +160,10 @@ class PaperSolver(SolverBase):
         binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
-        pose = Pose.identity(translation.to(self.device))
+        pose = Pose.identity(translation.to(self._observer.device))
         prototype = prototype_mesh(self.config.object, ellipse)
-        shape = Shape.of(prototype, self.config.object.flat, self.device)
-        size = self.config.object.texture_size
+        shape = Shape.of(prototype, self.config.object.flat, self._observer.device)
+        size, device = self.config.object.texture_size, self._observer.device
         offsets = torch.zeros_like(shape.rest)
         if shape.flat:
             # Facing the camera: any plane fits a ball, and the one that fits an ellipsoid best is seen edge-on.
@@ -86,10 +173,11 @@ class PaperSolver(SolverBase):
             shape,
             TexelMap.of(shape.face_uvs, size),
             offsets,
-            torch.zeros(self._channels, size, size, device=self.device),
+            torch.zeros(self._channels, size, size, device=device),
             (),
             BackProjection(
-                torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
+                torch.zeros(3, size, size, device=device),
+                torch.zeros(size, size, device=device),
             ),
             (pose, frame.index),
             waiting=() if self.settings.init_frames > 1 else None,
@@ -129,7 +217,7 @@ class PaperSolver(SolverBase):
     def _observe(
         self, state: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        return self.observe(frame, mask, pose, state.vertices, state.camera, state.space)
+        return self._observer.observe(frame, mask, pose, state.vertices, state.camera, state.space)
 
     def _best_candidate(self, state: PaperState, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""

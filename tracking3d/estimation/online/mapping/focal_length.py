@@ -77,20 +77,10 @@ def state_through_lens(state: SolverState, after: Camera) -> SolverState:
     factor = after.fy / before.fy
     if factor == 1:
         return state
-
-    def moved(at: tuple[Pose, int]) -> tuple[Pose, int]:
-        return pose_through_lens(at[0], factor), at[1]
-
-    object_map = map_through_lens(state.object_map, before, after)
-    return replace(
-        state,
+    return state.moved(
+        map_through_lens(state.object_map, before, after),
+        lambda pose: pose_through_lens(pose, factor),
         camera=after,
-        object_map=object_map,
-        surface=object_map.surface(),
-        last_pose=moved(state.last_pose),
-        previous_pose=state.previous_pose and moved(state.previous_pose),
-        trajectory=tuple(map(moved, state.trajectory)),
-        motion_references=(),
         inactive_maps=tuple(inactive_map_through_lens(other, before, after) for other in state.inactive_maps),
     )
 

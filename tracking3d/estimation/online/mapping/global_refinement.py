@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig
-from tracking3d.estimation.online.mapping.focal_length import lens_change, solve_lens
-from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
+from tracking3d.estimation.online.mapping.focal_length import (
+    lens_change,
+    map_through_lens,
+    solve_lens,
+    state_through_lens,
+)
+from tracking3d.estimation.online.mapping.keyframe_insertion import draw_keyframes, refine_local_map
+from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of, window_of
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, render_cost
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import pose_from_arrays
+from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
+from tracking3d.points.robust_bundle import intersect
 
 _PASSES = 3
 _FOCAL_LENGTH_PENALTY = 0.01
@@ -64,3 +79,117 @@ def _refine_with_lens(
     for _ in range(_PASSES):
         object_map = refine_local_map(object_map, camera, everything, config, bundle_iterations=15, rounds=2)
     return keyframe_cost(object_map), object_map, camera
+
+
+# The map refined by landmarks that are followed densely over its keyframes, with the focal length if it is not given.
+#
+# Local mapping knows keypoints and corners that were tracked from frame to frame, and a surface that is a few percent
+# off. Poses drift with both. Here corners are followed from keyframe to keyframe through the surface and bundled with
+# the poses, as the final refinement does it (`tracking3d.points.landmark_adjustment`). Local mapping then keeps the
+# poses of these keyframes.
+
+_ROUNDS = 2
+"""Each leaves some tenths of an error, and so do those at the next keyframe."""
+_LEAST_KEYFRAMES = 4
+_NEW_SHARE = 0.1
+"""Share of the keyframes that are new, from which on the map is refined again: a refinement takes time for every
+keyframe, so that a frame of a long video costs as much as one of a short one."""
+_SHAPE_ROUNDS = 2
+"""Of the surface fit afterwards: dense landmarks leave the rim of the surface where they found it."""
+_TRACK_DEVIATION = 1.0  # pixels, of points that were tracked from frame to frame
+_HELD = 0.05  # deviation of the map's landmarks from the surface, in radii
+
+
+def refine_by_landmarks(state: SolverState, config: OnlineConfig) -> SolverState:
+    """The state with map, camera and last pose refined by dense landmarks; unchanged if these say too little.
+
+    Nothing happens before enough keyframes are new.
+
+    Args:
+        state: The state after a keyframe was inserted.
+        config: The solver's options.
+    """
+    object_map = state.object_map
+    if object_map.pointless or object_map.fixed_keyframes or not _is_due(object_map):
+        return state
+    newest = object_map.keyframes[-1].index
+    object_map = replace(object_map, asked_landmarks=newest)
+    refined = _refine_map(object_map, state.camera, config)
+    if refined is None:
+        return replace(state, object_map=object_map)
+    object_map, camera = refined
+    state = state_through_lens(state, camera)
+    if state.last_pose[1] == newest:
+        state = replace(state, last_pose=(object_map.keyframes[-1].pose, newest))
+    return state.with_map(object_map)
+
+
+def _is_due(object_map: ObjectMap) -> bool:
+    """Whether enough keyframes are new since the map was last refined."""
+    count = len(object_map.keyframes)
+    new = sum(view.index > object_map.asked_landmarks for view in object_map.keyframes)
+    return count >= _LEAST_KEYFRAMES and new >= max(1.0, _NEW_SHARE * count)
+
+
+def _refine_map(
+    object_map: ObjectMap, camera: Camera, config: OnlineConfig
+) -> tuple[ObjectMap, Camera] | None:
+    """The refined map in the object frame of its first keyframe, and the camera; None if landmarks say too little."""
+    scene = draw_keyframes(object_map, camera, list(range(len(object_map.keyframes))))
+    if scene.views[0] is None or sum(view is not None for view in scene.views) < _LEAST_KEYFRAMES:
+        return None
+    scene = refine_through(scene, _ROUNDS, camera)
+    if not is_supported(scene):
+        return None
+    if scene.focal_factor != 1:
+        solved = camera.with_solved_focal(scene.focal_factor)
+        object_map, camera = map_through_lens(object_map, camera, solved), solved
+    object_map = _triangulate(_take_over(object_map, scene), camera)
+    positions = window_of(len(object_map.keyframes), config.local_window)
+    object_map = fit_shape(object_map, positions, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
+    return object_map.with_textures(), camera
+
+
+def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
+    """The map with a scene's surface and poses, turned so that the pose of the first keyframe stays."""
+    first = scene.views[0]
+    assert first is not None
+    T_map_scene = np.linalg.inv(object_map.keyframes[0].pose.matrix().numpy()) @ first.T_cam_obj
+    T_scene_map = np.linalg.inv(T_map_scene)
+    keyframes = list[Keyframe]()
+    for view, drawn in zip(object_map.keyframes, scene.views, strict=True):
+        if drawn is not None:
+            T = drawn.T_cam_obj @ T_scene_map
+            pose = pose_from_arrays(T[:3, :3], T[:3, 3], object_map.vertices)
+            view = replace(view, pose=pose, is_adjusted=True)
+        keyframes.append(view)
+    vertices = torch.from_numpy(_transform(T_map_scene, scene.vertices)).to(object_map.vertices)
+    landmarks = _transform(T_map_scene, object_map.landmarks)
+    return replace(object_map, vertices=vertices, landmarks=landmarks, keyframes=tuple(keyframes))
+
+
+def _triangulate(object_map: ObjectMap, camera: Camera) -> ObjectMap:
+    """The map with its landmarks where its poses and its surface put them."""
+    views = list(object_map.keyframes)
+    names = np.unique(np.concatenate([view.points.landmark for view in views]))
+    names = names[~object_map.candidate[names]]
+    places = surface_places(object_map, camera, views, names)
+    on_surface = np.isfinite(places).all(1)
+    names, places = names[on_surface], places[on_surface]
+    if not len(names):
+        return object_map
+    tracks = tracks_of(views, names)
+    landmarks = object_map.landmarks.copy()
+    landmarks[names], _ = intersect(
+        places,
+        np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (len(views), 1)),
+        np.stack([view.pose.matrix().numpy() for view in views]),
+        tracks.pixels,
+        np.where(tracks.visible, _TRACK_DEVIATION, np.inf),
+        _HELD * object_map.radius,
+    )
+    return replace(object_map, landmarks=landmarks)
+
+
+def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])

@@ -5,20 +5,32 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import takewhile
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.bundle_adjustment.adjustment import Structure, adjust
+from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.features.sift import detect
-from tracking3d.estimation.online.mapping.candidate_landmarks import promote_candidates, with_candidates
-from tracking3d.estimation.online.mapping.local_mapping import refine_map, window_of, with_landmarks
+from tracking3d.estimation.online.mapping.local_mapping import (
+    mask_weight,
+    refine_map,
+    tracks_of,
+    viewing_angle,
+    window_of,
+    with_landmarks,
+)
 from tracking3d.estimation.online.mapping.photometric_adjustment import refine_without_points
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, rotation_angle
+from tracking3d.geometry.pose import Pose, pose_arrays, rotation_angle
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.view import LANDMARK_WINDOW, cut_window, draw_into_window
 from tracking3d.scene.surface import Drawn
@@ -28,6 +40,32 @@ _FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake
 _MIN_INTERVAL = 3  # frames between two such keyframes
 _MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
 _MAX_KEYFRAMES_WITHOUT_POINTS = 15
+
+
+def view_frame(
+    observer: Observer,
+    state: SolverState,
+    frame: Frame,
+    mask: NDArray[np.bool_] | None,
+    pose: Pose,
+    followed: FollowedPoints,
+) -> Keyframe:
+    """A frame seen from a pose, with the mask weight that follows from the points.
+
+    Args:
+        observer: How it becomes an observation.
+        state: Its map, camera and feature space.
+        frame: The frame.
+        mask: ``(H, W)`` its initial mask, or None.
+        pose: Where the object is about.
+        followed: The points that were followed into it.
+    """
+    object_map, camera = state.object_map, state.camera
+    observation = observer.observe(frame, mask, pose, object_map.vertices, camera, state.feature_space)
+    on_object = followed.only(~object_map.candidate[followed.landmark])
+    weight = 1.0 if observer.config.object.trust_masks else mask_weight(mask, on_object)
+    window = cut_around_object(object_map, camera, frame.image, mask, pose)
+    return Keyframe(observation, mask, pose, followed, mask_weight=weight, image=window)
 
 
 def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineConfig) -> bool:
@@ -200,3 +238,195 @@ def draw_keyframes(object_map: ObjectMap, camera: Camera, positions: list[int]) 
             view = object_map.keyframes[position]
             scene.views[position] = draw_keyframe(object_map, camera, view, view.pose)
     return scene
+
+
+# Candidate landmarks: points outside the mask that move with the object, and so show where the mask is too small.
+#
+# Corners around the mask are tracked like the object's own. Once a few keyframes show one, it is triangulated with
+# their poses. A point of the object fits them and has moved in the image; one of the background fits only while nothing
+# moves. If the object is still and the camera moves, everything fits: then no candidate becomes part of the object, but
+# the candidates constrain the pose.
+
+MOST_CANDIDATES = 100
+_BAND_WIDTH = 0.25  # width of the band around the mask, relative to the root of its area
+_VIEWS = 3
+_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
+    1.0,
+    2.5,
+)  # mean residual in pixels at an object size of 200 pixels
+_MIN_MOTION = 6.0  # such pixels
+_MIN_ROTATION = 12.0
+"""Degrees by which an object that rested at first must have been seen to turn while a candidate was tracked: a thing on
+a table turns less, if a hand touches it or the camera moves in a hand, and then the table fits as well as it does."""
+_MAX_STATIC_MOTION = 0.3  # share of the motion that the object would have caused
+_SECTORS = 8  # directions into which the surroundings are divided
+_STATIC_SHARE = 0.6  # share of a sector's candidates, and of the sectors, that fit if the scene is static
+_MIN_SECTORS, _MIN_CANDIDATES = (
+    5,
+    3,
+)  # fewest sectors that can be tested, and fewest candidates of such a sector
+
+
+def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(H, W)`` the band around a mask."""
+    reach = max(round(_BAND_WIDTH * float(np.sqrt(mask.sum()))), 3)
+    return dilate_by_ellipse(mask, reach) & ~mask
+
+
+def dilate_by_ellipse(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """``(H, W)`` a mask dilated by OpenCV's ellipse of ``2 reach + 1`` pixels.
+
+    Row by row of the ellipse: that takes a time that grows with its height, and OpenCV's own grows with its area.
+    """
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if not width:
+        return np.zeros_like(mask)
+    rows = slice(max(y - reach, 0), min(y + height + reach, len(mask)))
+    columns = slice(max(x - reach, 0), min(x + width + reach, mask.shape[1]))
+    inside = mask[rows, columns]
+    place = np.arange(inside.shape[1], dtype=np.int32)
+    far = np.int32(4 * mask.shape[1])
+    before = place - np.maximum.accumulate(np.where(inside, place, -far), axis=1)
+    after = np.minimum.accumulate(np.where(inside, place, far)[:, ::-1], axis=1)[:, ::-1] - place
+    beside = np.minimum(np.minimum(before, after), reach + 1).astype(
+        np.int16
+    )  # pixels to the mask along the row
+    reached = np.zeros_like(inside)
+    half = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)).sum(1) // 2
+    count = len(inside)
+    for offset in range(-min(reach, count - 1), min(reach, count - 1) + 1):
+        to = slice(max(-offset, 0), min(count - offset, count))
+        there = slice(max(offset, 0), min(count + offset, count))
+        reached[to] |= beside[there] <= half[reach + offset]
+    dilated = np.zeros_like(mask)
+    dilated[rows, columns] = reached
+    return dilated
+
+
+def with_candidates(
+    object_map: ObjectMap, view: Keyframe, image: NDArray[np.uint8]
+) -> tuple[ObjectMap, Keyframe]:
+    """Add corners around a view's mask as candidate landmarks."""
+    if view.mask is None:
+        return object_map, view
+    there = int(object_map.candidate[view.points.landmark].sum())
+    corners = new_corners(image, surroundings(view.mask), view.points.pixel, MOST_CANDIDATES - there)
+    names = len(object_map.landmarks) + np.arange(len(corners))
+    points = FollowedPoints(
+        np.concatenate([view.points.landmark, names]), np.concatenate([view.points.pixel, corners])
+    )
+    object_map = replace(
+        object_map,
+        landmarks=np.concatenate([object_map.landmarks, np.full((len(corners), 3), np.nan)]),
+        candidate=np.concatenate([object_map.candidate, np.ones(len(corners), bool)]),
+    )
+    return object_map, replace(view, points=points)
+
+
+def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap:
+    """Promote candidates to landmarks, or drop them, if the keyframes at ``positions`` show which they are."""
+    views = [object_map.keyframes[position] for position in positions]
+    names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
+    names = names[(counts >= 2) & object_map.candidate[names]]
+    if not len(names):
+        return object_map
+    tracks = tracks_of(views, names)
+    poses = [pose_arrays(view.pose) for view in views]
+    R, t = np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
+    first = tracks.visible.argmax(0)
+    pixel = tracks.pixels[first, np.arange(len(names))]
+    ray = (pixel - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    x_cam = np.concatenate([ray, np.ones((len(ray), 1))], 1) * t[first, 2:]
+    start = Structure(R, t, np.einsum("nji,nj->ni", R[first], x_cam - t[first]))
+    scale = max(1.0, views[-1].observation.window.side / 200)
+    found = adjust(tracks, camera.K, start, fixed=len(views), scale=scale, iterations=8)
+    known_residual = np.isfinite(found.residual)
+    total = np.where(known_residual, found.residual, 0.0).sum(0)
+    # A point that ends up behind every camera has no residual, and fits nothing.
+    residual = np.divide(
+        total / scale, known_residual.sum(0), out=np.full(len(names), np.inf), where=known_residual.any(0)
+    )
+    motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
+    # A point that stays although the object would have moved it is not on the object.
+    carried = np.linalg.norm(
+        project_camera_points(transform_to_camera(R, t, start.points), camera.K) - pixel, axis=2
+    )
+    carried = np.nanmax(np.where(tracks.visible, carried, np.nan), 0) / scale
+    stays = (carried > _MIN_MOTION) & (motion < _MAX_STATIC_MOTION * carried)
+    near = (
+        np.linalg.norm(found.points - object_map.vertices.mean(0).cpu().numpy(), axis=1)
+        < 1.6 * object_map.radius
+    )
+    enough = tracks.visible.sum(0) >= _VIEWS
+    fits = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
+    accepted = fits
+    if object_map.started_at_rest:
+        accepted = fits & (_rotation_seen(views, tracks.visible, first) > _MIN_ROTATION)
+    rejected = stays | (enough & ((residual > _MIN_OUTLIER_RESIDUAL) | ~near) & (motion > _MIN_MOTION))
+    rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~fits
+    told = enough & (motion > _MIN_MOTION)
+    beside = object_map.candidates_around + _by_sector(
+        views, first, pixel, told, residual < _MAX_INLIER_RESIDUAL
+    )
+    around = np.zeros_like(accepted)
+    if is_static_scene(beside):
+        # They constrain the pose as well as the object's own points do, but not its shape or mask.
+        around, accepted = told & (residual < _MAX_INLIER_RESIDUAL), np.zeros_like(accepted)
+        rejected = (told | (tracks.visible.sum(0) >= 2 * _VIEWS)) & ~around
+    landmarks, candidate = object_map.landmarks.copy(), object_map.candidate.copy()
+    placed = accepted | around
+    landmarks[names[placed]] = found.points[placed]
+    candidate[names[accepted]] = False
+    dropped = names[rejected & ~accepted]
+    keyframes = tuple(
+        replace(view, points=view.points.only(~np.isin(view.points.landmark, dropped)))
+        for view in object_map.keyframes
+    )
+    return replace(
+        object_map, landmarks=landmarks, candidate=candidate, keyframes=keyframes, candidates_around=beside
+    )
+
+
+def _rotation_seen(
+    views: list[Keyframe], visible: NDArray[np.bool_], first: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """``(N,)`` degrees by which each candidate has been seen to turn, since the first view that shows it."""
+    angles = np.array([[viewing_angle(a.pose, b.pose) for b in views] for a in views])
+    seen: NDArray[np.float64] = np.where(visible.T, angles[first], 0.0).max(1)
+    return seen
+
+
+def is_static_scene(beside: NDArray[np.int64]) -> bool:
+    """Whether everything around the object moves with it: then the object is still, and the camera moves.
+
+    A mask that is too small has points of the object outside it on some sides only, as has one next to a hand.
+
+    Args:
+        beside: ``(S, 2)`` candidates in each sector around the object: those that could be tested, and those that fit.
+    """
+    told, fit = beside.T
+    tells = told >= _MIN_CANDIDATES
+    if tells.sum() < _MIN_SECTORS:
+        return False
+    return bool((fit[tells] > _STATIC_SHARE * told[tells]).mean() > _STATIC_SHARE)
+
+
+def _by_sector(
+    views: list[Keyframe],
+    first: NDArray[np.intp],
+    pixel: NDArray[np.float64],
+    told: NDArray[np.bool_],
+    fits: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """``(S, 2)`` candidates in each direction from the mask's centre: those tested, and those that fit."""
+    counts = np.zeros((_SECTORS, 2), np.int64)
+    for number in np.unique(first[told]):
+        mask = views[number].mask
+        if mask is None or not mask.any():
+            continue
+        chosen = told & (first == number)
+        x, y = (pixel[chosen] - np.argwhere(mask)[:, ::-1].mean(0)).T
+        sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
+        np.add.at(counts, (sector, 0), 1)
+        np.add.at(counts, (sector[fits[chosen]], 1), 1)
+    return counts

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.bundle_adjustment.reprojection import FloatArray
+from tracking3d.config.models import OnlineConfig
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import NormalEquations
 
@@ -32,6 +33,12 @@ class PoseWeights:
     points: float = 1.0  # weight of the mean over the matched points
     points_scale: float = 1.0  # pixels at full working resolution at which the loss is log 2
     unseen: float = 0.5  # cost of a covered pixel of unseen texture, in place of its loss
+
+    @staticmethod
+    def of(options: OnlineConfig) -> PoseWeights:
+        """The weights that the solver's options name."""
+        weights = options.weights
+        return PoseWeights(weights.appearance, outline=weights.outline, points=weights.points)
 
 
 @dataclass(frozen=True, eq=False)

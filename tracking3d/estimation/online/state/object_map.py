@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
-from tracking3d.estimation.shape import Shape
+from tracking3d.estimation.shape import Shape, visible_texture
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.points.landmark_adjustment import LandmarkScene
@@ -138,6 +139,22 @@ class ObjectMap:
         texture = total.mean().permute(1, 2, 0).contiguous().permute(2, 0, 1)
         seen = (total.weight > 0).float()[None]
         return Surface(self.vertices, self.shape.faces, self.shape.face_uvs, texture, seen, self.renderer)
+
+    def model(self, surface: Surface) -> ObjectModel:
+        """The mesh with its visible texture back-projected from the keyframes; ``surface`` has the features."""
+        size = self.texels.size
+        seen = BackProjection(self.vertices.new_zeros(3, size, size), self.vertices.new_zeros(size, size))
+        for view in self.keyframes:
+            seen = seen + self.back_project(view.observation.image, view)
+        texture, weight = visible_texture(seen)
+        return ObjectModel(
+            self.vertices.double().cpu().numpy(),
+            self.shape.faces.cpu().numpy(),
+            self.shape.face_uvs.double().cpu().numpy(),
+            texture,
+            weight,
+            surface.texture.permute(1, 2, 0).cpu().numpy(),
+        )
 
     def silhouette(self, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
         """Hard silhouette ``(H, W)`` in the full frame."""

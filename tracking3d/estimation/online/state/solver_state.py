@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any
@@ -114,7 +114,7 @@ class SolverState:
     # estimated anew. Empty if it cannot be restarted.
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     # the initialization that is computed in another thread, if there is one; see
-    # `tracking3d.estimation.online.map_initialization`
+    # `tracking3d.estimation.online.initializer`
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
@@ -123,6 +123,25 @@ class SolverState:
         if self.pending is not None:
             return SolverPhase.INITIALIZING
         return SolverPhase.LOST if self.lost_frames else SolverPhase.TRACKING
+
+    def with_map(self, object_map: ObjectMap, **changes: Any) -> SolverState:
+        """The state with another map and its surface, and with further changes."""
+        return replace(self, object_map=object_map, surface=object_map.surface(), **changes)
+
+    def moved(self, object_map: ObjectMap, move: Callable[[Pose], Pose], **changes: Any) -> SolverState:
+        """The state with a map in other coordinates, which ``move`` takes the last poses to."""
+
+        def there(at: tuple[Pose, int]) -> tuple[Pose, int]:
+            return move(at[0]), at[1]
+
+        changes = {
+            "last_pose": there(self.last_pose),
+            "previous_pose": self.previous_pose and there(self.previous_pose),
+            "trajectory": tuple(map(there, self.trajectory)),
+            "motion_references": (),
+            **changes,
+        }
+        return self.with_map(object_map, **changes)
 
     def advanced(
         self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints

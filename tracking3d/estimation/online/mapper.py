@@ -1,4 +1,4 @@
-"""Reverses the map's depth if that explains its keyframes better.
+"""The mapper: inserts a frame into the map, refines it, and reverses its depth if that explains its keyframes better.
 
 The initialization chooses between the two reversals; after a small rotation its choice can be wrong. See
 `tracking3d.bundle_adjustment.adjustment`.
@@ -10,17 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.config.models import OnlineConfig
-from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
+from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
+from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, refine_local_map
 from tracking3d.estimation.online.mapping.local_mapping import (
     shared_landmarks,
     structure_of,
     tracks_of,
     viewing_angle,
 )
-from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
@@ -42,6 +44,23 @@ _LANDMARK_PRIOR = (
 _SCALE = 1.0  # pixels
 
 
+def insert_frame(
+    state: SolverState, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
+) -> SolverState:
+    """The state with its last frame as a new keyframe, and the map refined.
+
+    Args:
+        state: After the frame.
+        view: The frame with its pose and the points that agree with it.
+        image: ``(H, W)`` grey.
+        config: The solver's options.
+    """
+    object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config)
+    last = object_map.keyframes[-1].pose, view.index
+    state = state.with_map(object_map, last_pose=last, tracked_points=followed)
+    return refine_by_landmarks(fix_depth_reversal(state, config), config)
+
+
 def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
     """The state with its depth reversed if that explains the keyframes better, else unchanged."""
     object_map, views = state.object_map, state.object_map.keyframes
@@ -58,16 +77,13 @@ def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
     object_map = refine_local_map(
         object_map, state.camera, everything, config, bundle_iterations=20, rounds=2
     )
-    before = state.previous_pose and (
-        _reverse_pose(state.previous_pose[0], reversal),
-        state.previous_pose[1],
-    )
-    trail = tuple((_reverse_pose(pose, reversal), index) for pose, index in state.trajectory)
     last = object_map.keyframes[-1].pose, state.last_pose[1]
-    return replace(
-        state, object_map=object_map, surface=object_map.surface(), last_pose=last, previous_pose=before,
-        trajectory=trail, motion_references=(), reversal_attempt=(0, 0.0),
-    )  # fmt: skip
+
+    def reverse(pose: Pose) -> Pose:
+        T = reversal.poses(pose.matrix().numpy())
+        return pose_from_arrays(T[:3, :3], T[:3, 3], pose.translation)
+
+    return state.moved(object_map, reverse, last_pose=last, reversal_attempt=(0, 0.0))
 
 
 def _due(tried: tuple[int, float], keyframes: int, turned: float) -> bool:
@@ -111,8 +127,3 @@ def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, O
         for view, pose in zip(views, poses, strict=True)
     )
     return reversal, replace(object_map, vertices=surface, landmarks=landmarks, keyframes=keyframes)
-
-
-def _reverse_pose(pose: Pose, reversal: Reversal) -> Pose:
-    T = reversal.poses(pose.matrix().numpy())
-    return pose_from_arrays(T[:3, :3], T[:3, 3], pose.translation)

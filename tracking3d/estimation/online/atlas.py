@@ -28,12 +28,11 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import (
     refine_local_map,
 )
 from tracking3d.estimation.online.mapping.local_mapping import nearest_views, project_points
-from tracking3d.estimation.online.relocalization.pose_search import poses_from_matches
+from tracking3d.estimation.online.pose_tracking import extrapolate_motion, pixel_scale
+from tracking3d.estimation.online.relocalization import poses_from_matches
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
-from tracking3d.estimation.online.tracking.motion_model import extrapolate_motion
-from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
@@ -95,15 +94,10 @@ def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -
     rest = torch.from_numpy(similarity.points(shape.rest.double().cpu().numpy())).to(shape.rest)
     object_map = replace(transform_map(begun.object_map, similarity), shape=replace(shape, rest=rest))
     first = object_map.keyframes[0].index
-    before, now = begun.previous_pose, begun.last_pose
-    return replace(
-        begun,
+    return begun.moved(
+        object_map,
+        lambda pose: transform_pose(pose, similarity),
         camera=state.camera,
-        object_map=object_map,
-        surface=object_map.surface(),
-        last_pose=(transform_pose(now[0], similarity), now[1]),
-        previous_pose=before and (transform_pose(before[0], similarity), before[1]),
-        trajectory=tuple((transform_pose(pose, similarity), index) for pose, index in begun.trajectory),
         colours=state.colours,
         inactive_maps=_limit_maps(
             (*state.inactive_maps, _deactivate(state, (*state.spans, (state.active_since, first - 1))))
@@ -303,20 +297,14 @@ def _with_merged_map(
 ) -> SolverState:
     newest = object_map.keyframes[-1]
     at_newest = newest.index == state.last_pose[1]
-    last = newest.pose if at_newest else transform_pose(state.last_pose[0], similarity)
     points = newest.points.spread_out(MOST_FOLLOWED, float(newest.observation.window.side))
-    before = state.previous_pose
     usual = other.baseline if other.baseline.frames > state.baseline.frames else state.baseline
-    return replace(
-        state,
-        object_map=object_map,
-        surface=object_map.surface(),
-        last_pose=(last, state.last_pose[1]),
-        previous_pose=before and (transform_pose(before[0], similarity), before[1]),
-        trajectory=tuple((transform_pose(pose, similarity), index) for pose, index in state.trajectory),
+    return state.moved(
+        object_map,
+        lambda pose: transform_pose(pose, similarity),
+        **({"last_pose": (newest.pose, newest.index)} if at_newest else {}),
         tracked_points=points if at_newest else FollowedPoints.none(),
         baseline=usual if usual.frames else LossBaseline(),
-        motion_references=(),
         inactive_maps=tuple(one for one in state.inactive_maps if one is not other),
         spans=(*state.spans, *other.spans),
         unaligned=state.unaligned and other.unaligned,

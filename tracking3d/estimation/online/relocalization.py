@@ -20,9 +20,8 @@ from tracking3d.estimation.online.mapping.local_mapping import (
 )
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.tracking.motion_model import align_to_mask
-from tracking3d.estimation.online.tracking.pose_tracking import (
+from tracking3d.estimation.online.pose_tracking import (
+    align_to_mask,
     candidate_cost,
     count_inliers,
     find_inliers,
@@ -30,6 +29,8 @@ from tracking3d.estimation.online.tracking.pose_tracking import (
     pixel_scale,
     pose_of_points,
 )
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.rendering import Surface
@@ -81,28 +82,22 @@ Found = tuple[str, PoseFit, FollowedPoints]
 
 
 def relocalize(
-    object_map: ObjectMap,
-    surface: Surface,
-    camera: Camera,
-    view: Keyframe,
-    image: NDArray[np.uint8],
-    best: Found,
-    weights: PoseWeights,
-    lost_for: int,
+    state: SolverState, view: Keyframe, image: NDArray[np.uint8], best: Found, weights: PoseWeights
 ) -> Found:
     """The best of the candidate so far and the costly hypotheses, by how they re-render the frame.
 
+    If the object was lost, all of its sides are tried, whatever the last pose was, but less often the longer it has
+    been lost.
+
     Args:
-        object_map: The map; surface: Its surface.
-        camera: The camera of the full frame.
+        state: The state before the frame.
         view: The frame.
         image: ``(H, W)`` grey.
         best: The best candidate so far.
         weights: The weights of the cost terms.
-        lost_for: For how many frames the object had been lost before this one. If it was lost, all of its sides are
-            tried, whatever the last pose was, but less often the longer it has been lost.
     """
-    lost = lost_for > 0
+    object_map, surface, camera, lost = state.object_map, state.surface, state.camera, state.lost_frames > 0
+    assert surface is not None
 
     def fitted(name: str, pose: Pose, points: FollowedPoints, asked: FollowedPoints) -> Found:
         _, fit = fit_pose(object_map, surface, view, {name: pose}, points, weights)
@@ -111,7 +106,7 @@ def relocalize(
     tried = [best]
     for pose, points in match_keyframes(object_map, camera, replace(view, pose=best[1].pose), image, lost):
         tried.append(fitted("keyframe", pose, points, points))
-    if view.mask is not None and (should_retry(lost_for)):
+    if view.mask is not None and should_retry(state.lost_frames):
         centre = best[1].pose
         if lost:
             placed = {str(n): pose for n, pose in enumerate(aligned_keyframes(object_map, camera, view))}

@@ -270,10 +270,8 @@ def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
     if object_map is state.object_map:
         return state
     last = object_map.keyframes[-1]
-    return replace(
-        state,
-        object_map=object_map,
-        surface=object_map.surface(),
+    return state.with_map(
+        object_map,
         last_pose=(last.pose, last.index),
         previous_pose=None,
         trajectory=((last.pose, last.index),),

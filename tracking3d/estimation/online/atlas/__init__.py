@@ -1,1 +1,0 @@
-"""Several maps: switching between them, aligning and merging them."""

@@ -1,0 +1,447 @@
+"""The initializer: frames wait until they show enough motion for a first map, and are then estimated with it.
+
+What decides about that is in `initialization`. A live source does not wait for it: the map is then made in another
+thread, and frames that come meanwhile are estimated when it is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
+from tracking3d.estimation.observation import Observer
+from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.initialization.initial_map import InitialMap, with_contrast
+from tracking3d.estimation.online.initialization.pending_frames import (
+    add_pending_frame,
+    restart_if_misfit,
+    try_initialize,
+    why_no_map,
+)
+from tracking3d.estimation.online.initialization.photo_start import (
+    MOST_PHOTOS,
+    initial_map_of_photos,
+    start_of_photos,
+)
+from tracking3d.estimation.online.initialization.photo_tracks import Photo
+from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
+from tracking3d.estimation.online.mapping.keyframe_insertion import (
+    cut_around_object,
+    insert_points,
+    needs_keyframe,
+    refine_local_map,
+    view_frame,
+)
+from tracking3d.estimation.online.masks import (
+    initial_estimate,
+    learn_colours,
+    make_estimate,
+    measure_mask_agreement,
+)
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.pose_tracking import (
+    TRAJECTORY_LENGTH,
+    find_inliers,
+    fit_pose,
+    pixel_scale,
+    pose_evidence,
+    resect_pose,
+)
+from tracking3d.estimation.online.relocalization import poses_from_matches
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate, assess_pose
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.estimation.shape import Shape, first_translation, mask_ellipse, prototype_mesh
+from tracking3d.estimation.solver import PhotoEstimates, PhotoSet
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import TexelMap
+from tracking3d.runtime.background_attempt import BackgroundAttempt
+from tracking3d.runtime.stage_times import in_stage
+
+_LOOKS_FLAT = (
+    "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
+)
+_RESTARTED = "restarted"  # what the first poses come from, see `FrameEstimate.hypothesis`
+_LAST = "last"  # name of the pose of the frame before, see `pose_predictions`
+_IN_PROGRESS = "the first map is being computed"
+_FIRST_WAIT = 0.03
+"""Seconds that an attempt in the background is waited for: most find at once that the motion is too small."""
+Pending = tuple[Keyframe, FrameEstimate]
+"""A frame that waits for the first map, and its estimate so far."""
+
+
+@dataclass(frozen=True)
+class Initializer:
+    """Makes the first map, and estimates the frames that waited for it."""
+
+    observer: Observer  # how a frame becomes an observation
+    options: OnlineConfig  # of the online solver
+    # whether the first map is computed in another thread; the result then depends on the machine
+    in_background: bool
+
+    def begin(
+        self, frame: Frame, mask: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
+    ) -> tuple[SolverState, FrameEstimate]:
+        """The state after a first frame.
+
+        Args:
+            frame: The frame.
+            mask: ``(H, W)`` its mask, not empty.
+            camera: The camera of the full frame.
+            space: The feature space, if there is one already.
+        """
+        observer, config, ellipse = self.observer, self.observer.config, mask_ellipse(mask)
+        translation = torch.tensor(first_translation(ellipse, camera), dtype=torch.float32)
+        pose = Pose.identity(translation.to(observer.device))
+        shape = Shape.of(prototype_mesh(config.object, ellipse), config.object.flat, observer.device)
+        texels = TexelMap.of(shape.face_uvs, config.object.texture_size)
+        object_map = ObjectMap(
+            shape,
+            texels,
+            shape.rest,
+            np.zeros((0, 3)),
+            (),
+            np.zeros(0, bool),
+            renderer=config.runtime.renderer,
+        )
+        image = grey(frame.image)
+        state = SolverState(camera, object_map, None, (pose, frame.index), None, image, FollowedPoints.none())
+        observation = observer.observe(frame, mask, pose, object_map.vertices, camera, None)
+        if space is None:
+            channels = feature_channels(observer.encoder, config.object.texture_channels)
+            space = FeatureSpace.of(observation.features, observation.mask, channels)
+        observation = replace(observation, features=space.project(observation.features, observation.image))
+        window = cut_around_object(object_map, camera, frame.image, mask, pose)
+        view = Keyframe(observation, mask, pose, FollowedPoints.none(), image=window)
+        object_map, view = insert_points(object_map, camera, view, image)
+        estimate = initial_estimate(frame, mask, pose, camera)
+        state = replace(
+            state,
+            object_map=object_map,
+            feature_space=space,
+            tracked_points=view.points,
+            pending=((view, estimate),),
+        )
+        return state, estimate
+
+    def add(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> tuple[SolverState, FrameEstimate]:
+        """Add a frame to the pending ones, and make the first map if they show enough motion.
+
+        Args:
+            state: After the frame before.
+            frame: The frame.
+            image: ``(H, W)`` grey.
+            mask: ``(H, W)`` its initial mask, or None.
+        """
+        assert state.pending is not None
+        pose = state.last_pose[0]
+        followed = follow(state.grey, image, state.tracked_points)
+        view = view_frame(self.observer, state, frame, mask, pose, followed)
+        object_map, view = add_pending_frame(
+            state.object_map, tuple(v for v, _ in state.pending), view, image
+        )
+        estimate = initial_estimate(frame, mask, pose, state.camera)
+        state = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
+        state = state.advanced(pose, frame.index, image, view.points)
+        attempt = self._try_in_background if self.in_background else self._try
+        state, found = attempt(state)
+        return state, replace(
+            estimate, reason=state.waiting_reason or estimate.reason
+        ) if found is None else found
+
+    def finish(self, state: SolverState) -> SolverState:
+        """The state after the last frame, with a first map if the pending frames determine one."""
+        state, start = try_initialize(state, self.options, ended=True)
+        if start is None:
+            return replace(state, waiting_reason=why_no_map(state))
+        return self._make_map(state, start)[0]
+
+    def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """See `tracking3d.estimation.solver.RefiningSolver`; an attempt that has failed is given up."""
+        begun = state.background
+        if begun is None or not begun.is_done(wait=None):
+            return state, None
+        return (replace(state, background=None), None) if begun.has_failed else self._adopt(state, begun)
+
+    def restart_if_misfit(self, state: SolverState) -> tuple[SolverState, tuple[FrameEstimate, ...]]:
+        """The state before the next frame, and new estimates of earlier ones if its map is restarted.
+
+        See `restart_if_misfit`. A live source would wait for seconds, so there it stays.
+        """
+        if self.in_background:
+            return state, ()
+        with in_stage("map"):
+            updated = restart_if_misfit(state, self.options)
+            if updated.object_map is state.object_map or not state.revisable:
+                return updated, ()
+            updated, revised = self._estimate_pending(updated, state.revisable, _RESTARTED, state.camera)
+        return updated, tuple(revised)
+
+    def has_points(self, state: SolverState, ended: bool) -> bool:
+        """See `tracking3d.estimation.solver.RefiningSolver`."""
+        if state.phase is SolverPhase.INITIALIZING:
+            start = try_initialize(state, self.options, ended=True)[1] if ended else None
+            return start is not None and not start.object_map.pointless
+        maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
+        return not all(one.pointless for one in maps)
+
+    def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
+        """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
+        camera = self.observer.camera
+        places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
+        chosen = [photos.indices[place] for place in places.round().astype(int)]
+        begun: SolverState | None = None
+        found, waiting = list[Photo](), list[Pending]()
+        for frame, mask in photos.read(chosen):
+            frame, binary = mask.on(frame), mask.found
+            if binary is None:
+                continue
+            if begun is None:
+                space = state.feature_space and replace(state.feature_space, contrast=0.0)
+                begun, _ = self.begin(frame, binary, camera, space)
+            depth = first_translation(mask_ellipse(binary), camera)
+            pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=self.observer.device))
+            view = view_frame(self.observer, begun, frame, binary, pose, FollowedPoints.none())
+            waiting.append((view, initial_estimate(frame, binary, pose, camera)))
+            found.append(Photo.of(frame.index, grey(frame.image), binary))
+        start = start_of_photos(found, camera)
+        if begun is None or start.structure is None:
+            return replace(state, waiting_reason=start.reason), PhotoEstimates((), start.reason)
+        weights = FitWeights(smoothness=self.options.smoothness)
+        views = [view for view, _ in waiting]
+        made, shown = initial_map_of_photos(begun.object_map, start, found, views, camera, weights)
+        pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
+        begun, last = self._make_map(replace(begun, pending=pending), made)
+        estimates = [*last.revised, replace(last, revised=())]
+        rest = sorted(set(photos.indices) - set(chosen))
+        estimates += [_find_photo(begun, frame, mask) for frame, mask in (photos.read(rest) if rest else ())]
+        return begun, PhotoEstimates(tuple(estimates), start.reason)
+
+    def _try(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """Make the first map if the pending frames determine it; None if they do not."""
+        with in_stage("map"):
+            state, start = try_initialize(state, self.options)
+        return (state, None) if start is None else self._make_map(state, start)
+
+    def _make_map(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
+        """Make the first map, and estimate all pending frames with it."""
+        if start.object_map.pointless and state.feature_space is not None:
+            space = state.feature_space.with_contrast()
+            state = replace(state, feature_space=space)
+            views = tuple(with_contrast(view, space) for view in start.object_map.keyframes)
+            start = replace(start, object_map=replace(start.object_map, keyframes=views))
+        assert state.pending is not None
+        everything = list(range(len(start.object_map.keyframes)))
+        waiting, before, camera = (*state.rested, *state.pending), state.camera, start.camera
+        with in_stage("map"):
+            object_map = refine_local_map(
+                start.object_map, camera, everything, self.options, bundle_iterations=20, rounds=3
+            )
+            updated = state.with_map(
+                object_map,
+                camera=camera,
+                pending=None,
+                rested=(),
+                revisable=waiting if start.object_map.pointless and not self.in_background else (),
+            )
+            updated = refine_by_landmarks(updated, self.options)
+            if self.observer.config.has_given_masks:
+                updated = measure_mask_agreement(updated)
+            updated, revised = self._estimate_pending(updated, waiting, start.origin, before)
+        estimate = replace(revised[-1], revised=tuple(revised[:-1]))
+        if start.origin == "flat" and not self.observer.config.object.flat and not estimate.reason:
+            estimate = replace(estimate, reason=_LOOKS_FLAT)
+        return updated, estimate
+
+    def _try_in_background(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+        """Make the first map in another thread; the newest frame keeps its initial mask until that is done."""
+        assert state.pending is not None
+        begun, newest, wait = state.background, state.pending[-1], 0.0
+        if begun is None:
+
+            def attempt() -> tuple[SolverState, list[FrameEstimate]]:
+                tried, found = self._try(state)
+                return tried, [] if found is None else [*found.revised, found]
+
+            def arrived(
+                made: SolverState, frames: Sequence[Pending]
+            ) -> tuple[SolverState, list[FrameEstimate]]:
+                return self._estimate_arrived(made, frames, state.camera)
+
+            begun, wait = BackgroundAttempt(attempt, arrived), _FIRST_WAIT
+        else:
+            begun.add(newest)
+        if begun.is_done(wait):
+            return self._adopt(state, begun)
+        return replace(state, background=begun), replace(newest[1], reason=_IN_PROGRESS)
+
+    def _adopt(
+        self, state: SolverState, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
+    ) -> tuple[SolverState, FrameEstimate | None]:
+        """The state with what came of an initialization, as if no frame had come meanwhile."""
+        outcome = begun.outcome()
+        found, estimates = outcome.state, outcome.results
+        if not estimates:
+            assert found.pending is not None
+            at_rest = found.object_map.started_at_rest
+            return replace(
+                state,
+                object_map=replace(state.object_map, started_at_rest=at_rest),
+                pending=(*found.pending, *outcome.left),
+                rested=found.rested,
+                next_attempt=found.next_attempt,
+                ambiguous_frames=found.ambiguous_frames,
+                ambiguous_rotation=found.ambiguous_rotation,
+                waiting_reason=found.waiting_reason,
+                background=None,
+            ), None
+        if outcome.left:
+            found, more = self._estimate_arrived(found, outcome.left, state.camera)
+            estimates = [*estimates, *more]
+        found = replace(found, grey=state.grey, background=None)
+        return found, replace(estimates[-1], revised=tuple(estimates[:-1]))
+
+    def _estimate_pending(
+        self, state: SolverState, waiting: tuple[Pending, ...], origin: str, before: Camera
+    ) -> tuple[SolverState, list[FrameEstimate]]:
+        """Estimate all pending frames with the first map, one after the other.
+
+        The map may have been made from some of them only. Those before these are estimated backwards in time. Those
+        after these that show something new become keyframes, so that their points are landmarks by the time that the
+        last frame is reached.
+
+        Args:
+            state: The state with the first map, as it was refined.
+            waiting: The pending frames, and the estimates that they had.
+            origin: What the map was found from.
+            before: The camera that the frames waited with.
+        """
+        poses = {view.index: view.pose for view in state.object_map.keyframes}
+        first = state.object_map.keyframes[0]
+        known = first.pose, first.index
+        earlier = [one for one in waiting if one[0].index < first.index]
+        state, backwards, _ = self._estimate_in_turn(state, earlier[::-1], known, poses, origin, before)
+        state, revised, trail = self._estimate_in_turn(
+            state, waiting[len(earlier) :], known, poses, origin, before
+        )
+        return replace(state, previous_pose=trail[-2]), [*backwards[::-1], *revised]
+
+    def _estimate_arrived(
+        self, state: SolverState, arrived: Sequence[Pending], before: Camera
+    ) -> tuple[SolverState, list[FrameEstimate]]:
+        """Estimate frames that came while the first map was computed, at least one, in the same way."""
+        names = max(int(view.points.landmark.max(initial=-1)) for view, _ in arrived) + 1
+        state = replace(state, object_map=_with_room(state.object_map, names), previous_pose=state.last_pose)
+        state, revised, trail = self._estimate_in_turn(state, arrived, state.last_pose, {}, _LAST, before)
+        trajectory = (*state.trajectory, *trail)[-TRAJECTORY_LENGTH:]
+        return replace(state, trajectory=trajectory, previous_pose=trajectory[-2]), revised
+
+    def _estimate_in_turn(
+        self,
+        state: SolverState,
+        waiting: Sequence[Pending],
+        known: tuple[Pose, int],
+        poses: Mapping[int, Pose],
+        origin: str,
+        before: Camera,
+    ) -> tuple[SolverState, list[FrameEstimate], list[tuple[Pose, int]]]:
+        """Estimate frames one after the other, each from the pose of the one before.
+
+        Args:
+            state: The state with the map.
+            waiting: The frames, and the estimates that they had.
+            known: A pose and the index of its frame; it stays if that is one of the frames.
+            poses: The poses of frames that the map was made from, by index.
+            origin: What the first poses come from.
+            before: The camera that the frames waited with.
+
+        Returns:
+            The state, the estimates, and the frames' poses and indices.
+        """
+        (pose, fixed), usual, revised, trail = known, state.baseline, list[FrameEstimate](), []
+        last, weights = max(poses, default=fixed), PoseWeights.of(self.options)
+        for seen, earlier in waiting:
+            view = with_focal_length(seen, before, state.camera)
+            if state.object_map.pointless:
+                view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
+            if state.feature_space is not None:
+                view = with_contrast(view, state.feature_space)
+            assert state.surface is not None
+            starts = {origin: poses.get(view.index, pose)}
+            fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
+            if view.index == fixed:
+                fit = replace(fit, pose=starts[origin])
+            kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
+            evidence = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
+            found = PoseCandidate(view, fit, origin, kept, evidence, assess_pose(fit, usual, evidence))
+            if view.index > last and _is_new(state, found, self.options):
+                state = _with_keyframe(state, found, self.options)
+                found = replace(found, fit=replace(fit, pose=state.object_map.keyframes[-1].pose))
+            pose, usual = found.fit.pose, usual.update(found.fit)
+            trail.append((pose, view.index))
+            estimate = make_estimate(state, earlier, found)
+            if all(view.index != other.index for other in state.object_map.keyframes):
+                shown = resect_pose(state.object_map, state.camera, view, pose)
+                estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
+            revised.append(estimate)
+            state = learn_colours(state, revised[-1], found)
+        if not trail:
+            return state, revised, trail
+        return replace(
+            state, last_pose=trail[-1], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]), baseline=usual,
+            tracked_points=view.points,
+        ), revised, trail  # fmt: skip
+
+
+def _find_photo(state: SolverState, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
+    """A photo that was not joined, by its matches with the nearest ones that were; lost if there are too few."""
+    pose, binary = state.last_pose[0], mask.found
+    nearest = sorted(state.object_map.keyframes, key=lambda view: abs(view.index - frame.index))
+    matched = []
+    if binary is not None:
+        [keypoints] = Photo.of(frame.index, grey(frame.image), binary).keypoints
+        scale = pixel_scale(nearest[0])
+        matched = poses_from_matches(state.object_map, state.camera, keypoints, nearest[:4], scale)
+    estimate = initial_estimate(frame, binary, matched[0][0] if matched else pose, state.camera)
+    decisive = bool(matched) and len(matched[0][1]) >= ENOUGH_POINTS
+    return replace(estimate, confidence=TRACKED_CONFIDENCE if decisive else 0.0)
+
+
+def _with_room(object_map: ObjectMap, names: int) -> ObjectMap:
+    """The map with landmarks whose places are not known, so that there are so many."""
+    more = max(names - len(object_map.landmarks), 0)
+    return replace(
+        object_map,
+        landmarks=np.concatenate([object_map.landmarks, np.full((more, 3), np.nan)]),
+        candidate=np.concatenate([object_map.candidate, np.zeros(more, bool)]),
+    )
+
+
+def _is_new(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> bool:
+    """Whether a pending frame is to be a keyframe; without points its pose is no better than the outline."""
+    points = found.evidence.inliers >= ENOUGH_POINTS and not state.object_map.pointless
+    return points and not found.lost and needs_keyframe(state.object_map, found, config)
+
+
+def _with_keyframe(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> SolverState:
+    """The map with a pending frame as one more keyframe; the points that were tracked into it become landmarks."""
+    view = replace(found.view, pose=found.fit.pose, points=found.points)
+    object_map = replace(state.object_map, keyframes=(*state.object_map.keyframes, view))
+    everything = list(range(len(object_map.keyframes)))
+    object_map = refine_local_map(
+        object_map, state.camera, everything, config, bundle_iterations=10, rounds=1
+    )
+    return state.with_map(object_map)

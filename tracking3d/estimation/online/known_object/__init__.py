@@ -1,1 +1,0 @@
-"""A solver whose map is given before the video."""

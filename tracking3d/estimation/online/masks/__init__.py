@@ -1,1 +1,0 @@
-"""From a pose to the frame's mask and estimate."""

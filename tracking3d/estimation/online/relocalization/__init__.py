@@ -1,1 +1,0 @@
-"""A pose without a prediction."""

@@ -1,0 +1,124 @@
+"""Estimates the pose of one frame: cheap hypotheses first, then costly ones, then a search of the whole frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import RELOCALIZED
+from tracking3d.estimation.observation import Observer
+from tracking3d.estimation.online.features.klt import follow
+from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
+from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.pose_tracking import (
+    find_inliers,
+    fit_pose,
+    is_consistent_with_motion,
+    pixel_scale,
+    pose_evidence,
+    pose_of_points,
+    pose_predictions,
+    predict_points,
+)
+from tracking3d.estimation.online.relocalization import (
+    ROTATION_SEARCH,
+    overlaps_mask,
+    relocalize,
+    relocalize_in_frame,
+    should_retry,
+)
+from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
+from tracking3d.estimation.online.state.object_map import Keyframe
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.frames import Frame
+from tracking3d.geometry.pose import Pose
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """Estimates the pose of an object with a map in one frame."""
+
+    observer: Observer  # how a frame becomes an observation
+    weights: PoseWeights  # of a pose's cost terms
+
+    def track(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> PoseCandidate:
+        """The pose in the frame after the state's last one.
+
+        Args:
+            state: After the frame before.
+            frame: The frame.
+            image: ``(H, W)`` grey.
+            mask: ``(H, W)`` its initial mask, or None.
+        """
+        starts = pose_predictions(state, frame.index, mask)
+        likeliest = next(iter(starts.values()))
+        followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
+        view = view_frame(self.observer, state, frame, mask, likeliest, followed)
+        return self.find(state, view, frame, image, starts)
+
+    def find(
+        self,
+        state: SolverState,
+        view: Keyframe,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        starts: dict[str, Pose],
+    ) -> PoseCandidate:
+        """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful."""
+        assert state.surface is not None
+        object_map, camera = state.object_map, state.camera
+        on_object = view.points.only(~object_map.candidate[view.points.landmark])
+        points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
+        if points is not None:
+            starts = {**starts, "points": points[0]}
+        won, fit = fit_pose(object_map, state.surface, view, starts, view.points, self.weights)
+        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        if state.phase is SolverPhase.LOST or needs_relocalization(fit, state.baseline, support):
+            won, fit, kept = relocalize(state, view, image, (won, fit, kept), self.weights)
+            support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        astray = state.phase is SolverPhase.LOST and not is_consistent_with_motion(
+            state, fit.pose, frame.index
+        )
+        assessment = assess_pose(fit, state.baseline, support, won == ROTATION_SEARCH, astray)
+        best = PoseCandidate(view, fit, won, kept, support, assessment)
+        if best.lost or (best.doubtful and should_retry(state.doubtful_frames)):
+            other = self._elsewhere(state, frame, image, view.mask)
+            return other if other is not None and other.better_than(best) else best
+        return best
+
+    def attempt(self, state: SolverState, view: Keyframe, origin: str, guessed: bool) -> PoseCandidate:
+        """The candidate from the pose and the points that a view comes with.
+
+        Args:
+            state: The state with a map.
+            view: The frame seen from that pose.
+            origin: What the pose was found by.
+            guessed: Whether it is a guess, see `assess_pose`.
+        """
+        assert state.surface is not None
+        object_map, camera = state.object_map, state.camera
+        _, fit = fit_pose(object_map, state.surface, view, {origin: view.pose}, view.points, self.weights)
+        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        assessment = assess_pose(fit, state.baseline, support, guessed=guessed)
+        return PoseCandidate(view, fit, origin, kept, support, assessment)
+
+    def _elsewhere(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> PoseCandidate | None:
+        """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
+        where = relocalize_in_frame(
+            state.object_map, state.camera, image, (state.trajectory or (state.last_pose,))[-1][0]
+        )
+        if where is None:
+            return None
+        pose, points = where
+        elsewhere = mask is None or not overlaps_mask(state.object_map.silhouette(pose, state.camera), mask)
+        view = view_frame(self.observer, state, frame, None if elsewhere else mask, pose, points)
+        found = self.attempt(state, view, RELOCALIZED, guessed=True)
+        return None if found.lost else found

@@ -1,1 +1,0 @@
-"""A pose near the predicted one."""
