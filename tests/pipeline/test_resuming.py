@@ -366,7 +366,7 @@ def test_a_run_whose_state_is_gone_is_refused(clip, images, tmp_path, monkeypatc
     stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
     state = tmp_path / "run" / layout.STATE / layout.STATE_FILE
     kept = state.read_bytes()
-    for damage in (kept[:100], b"[]", kept.replace(b'"version": 2', b'"version": 1')):
+    for damage in (kept[:100], b"[]", kept.replace(b'"version": 3', b'"version": 2')):
         state.write_bytes(damage)
         with pytest.raises(InputError, match=r"damaged|another version"):
             record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
