@@ -97,6 +97,21 @@ def test_masks_choose_the_tracker_and_need_no_prompt(call, clip, script, mask_fi
     assert all(config.tracker.options == {"path": "masks"} for config, _ in script.built)
 
 
+def test_the_alpha_of_cut_outs_is_their_masks_unless_something_else_is_given(call, script, tmp_path):
+    (tmp_path / "cut_outs").mkdir()
+    picture = np.full((48, 64, 4), 90, np.uint8)
+    picture[..., 3] = 0
+    picture[10:20, 30:50, 3] = 255
+    for index in range(3):
+        Image.fromarray(picture).save(tmp_path / f"cut_outs/{index}.png")
+    result = call("run", "cut_outs")
+    assert result.exit_code == 0 and "alpha of the images in cut_outs is taken" in result.stderr
+    assert "alpha" not in call("run", "cut_outs", *BOX, "--out", "b").stderr
+    assert "alpha" not in call("run", "cut_outs", *BOX, "--tracker", "csrt", "--out", "c").stderr
+    assert [config.tracker.name for config, _ in script.built] == ["precomputed", "segment", "csrt"]
+    assert script.built[0][0].tracker.options == {"path": "cut_outs"}
+
+
 def test_several_boxes_are_several_objects_with_a_folder_each(call, clip, script):
     result = call("run", clip, *BOX, "--box", "30,5,10,30", "--out", "run")
     assert result.exit_code == 0, result.output

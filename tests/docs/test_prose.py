@@ -36,3 +36,12 @@ def test_a_sentence_that_readers_stumbled_over_is_gone(phrase):
     spaced = re.compile(r"\s+".join(map(re.escape, phrase.split())))
     found = [text.relative_to(ROOT).as_posix() for text in TEXTS if spaced.search(text.read_text("utf-8"))]
     assert found == []
+
+
+def test_an_unreleased_entry_of_the_changelog_takes_at_most_three_lines():
+    changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    unreleased = changelog.partition("## [Unreleased]")[2].partition("\n## [")[0]
+    entries = re.findall(r"^- .*(?:\n .*)*", unreleased, re.MULTILINE)
+    assert [entry for entry in entries if entry.count("\n") > 2] == []
+    assert [line for line in unreleased.splitlines() if len(line) > 120] == []
+    assert re.findall(r"^[^-# \n].*", unreleased, re.MULTILINE) == []

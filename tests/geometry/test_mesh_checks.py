@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from tracking3d.errors import InputError
-from tracking3d.geometry import mesh
-from tracking3d.geometry.mesh import what_is_wrong
+from tracking3d.geometry import mesh_checks
+from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.geometry.prototypes import from_file
 from tracking3d_bench.datasets.truth import MeshFile
 from tracking3d_bench.synthesis.mesh_files import load_solid
@@ -54,5 +54,5 @@ def test_faces_of_vertices_that_are_not_there_and_too_many_faces_are_wrong(monke
     beyond = trimesh.Trimesh(ball.vertices, ball.faces, process=False)
     beyond.faces = np.where(ball.faces == 3, 99, ball.faces)
     assert "has faces of vertices that it has not (100 of 42)" in what_is_wrong(beyond)
-    monkeypatch.setattr(mesh, "MOST_FACES", 10)
+    monkeypatch.setattr(mesh_checks, "MOST_FACES", 10)
     assert "has 80 faces, and more than 10 are too many" in what_is_wrong(ball)

@@ -22,7 +22,7 @@ from tracking3d.estimation.known_object import KnownObject
 from tracking3d.estimation.online.known_object import SIDES, map_of_known_object
 from tracking3d.estimation.shape import RADIUS
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.mesh import read_mesh_file
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.pipeline.known_object import load_known_object, read_known_object, select_camera
 from tracking3d.plugins import FEATURES, build_plugin
 from tracking3d.rendering import TexelMap

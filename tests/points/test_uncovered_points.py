@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from solid_of_clip import mesh_of
 
+from tracking3d.points.answers import PointAnswers
 from tracking3d.points.image_following import ImageFollower
 from tracking3d.points.image_only import UncoveredPoints
-from tracking3d.points.online import KEPT, CausalPoints, PointAnswers
+from tracking3d.points.online import KEPT, CausalPoints
 from tracking3d.points.pictures import open_picture
 from tracking3d.points.view import open_view
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize

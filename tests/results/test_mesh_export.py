@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.geometry.mesh import read_mesh_file
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.prototypes import from_file
 from tracking3d.results.contact_sheet import most_different, render_view, side_shown
 from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model, sort_seen_first

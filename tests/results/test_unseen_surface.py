@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.geometry.mesh import read_mesh_file
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.results.mesh_export import (
     cut_unseen,
     export_mesh,

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.trackers.mask_files import holds_cut_outs
 from tracking3d.trackers.precomputed import PrecomputedMasks, match_masks
 from tracking3d.trackers.protocol import MaskTracker
 
@@ -133,6 +134,14 @@ def _palette(mask: np.ndarray) -> Pillow.Image:
     return image
 
 
+def _palette_with_alpha(mask: np.ndarray) -> Pillow.Image:
+    """A cut-out of 256 colours, as tools write that make files small; its background is not black."""
+    colours = np.dstack([mask * 60 + 90] * 3 + [mask * 255]).astype(np.uint8)
+    image = Pillow.fromarray(colours).quantize(8, method=Pillow.Quantize.FASTOCTREE)
+    assert image.mode == "P" and image.has_transparency_data
+    return image
+
+
 KINDS = {
     "8 bit.png": lambda m: Pillow.fromarray(m.astype(np.uint8) * 255),
     "0 and 1.png": lambda m: Pillow.fromarray(m.astype(np.uint8)),
@@ -142,6 +151,7 @@ KINDS = {
     "16 bit of 0 and 1.png": lambda m: Pillow.fromarray(m.astype(np.uint16)),
     "float.tif": lambda m: Pillow.fromarray(m.astype(np.float32)),
     "palette.png": _palette,
+    "palette and alpha.png": _palette_with_alpha,
     "colour.png": lambda m: Pillow.fromarray((m[..., None] * [200, 0, 20]).astype(np.uint8)),
     "opaque.png": lambda m: Pillow.fromarray(np.dstack([m * 255] * 3 + [m * 0 + 255]).astype(np.uint8)),
     "cut-out.png": lambda m: Pillow.fromarray(np.dstack([m * 0 + 90] * 3 + [m * 255]).astype(np.uint8)),
@@ -157,6 +167,15 @@ KINDS = {
 def test_every_kind_of_image(tmp_path: Path, name: str) -> None:
     KINDS[name](truth(0)).save(tmp_path / name)
     assert_truth(track(tmp_path, [frame(0, name)]), [0])
+
+
+def test_cut_outs_are_known_by_their_alpha(tmp_path: Path) -> None:
+    assert not holds_cut_outs(str(tmp_path / "absent")) and not holds_cut_outs(str(tmp_path))
+    for index in range(3):
+        KINDS["cut-out.png"](truth(index)).save(tmp_path / f"{index}.png")
+    assert holds_cut_outs(str(tmp_path))
+    KINDS["opaque.png"](truth(3)).save(tmp_path / "3.png")
+    assert not holds_cut_outs(str(tmp_path))
 
 
 def test_jpeg_masks_are_thresholded(tmp_path: Path) -> None:

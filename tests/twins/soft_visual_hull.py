@@ -17,7 +17,7 @@ def carried(
     by_depth: float,
     beyond: float,
 ) -> NDArray[np.int8] | None:
-    """See `tracking3d.segmentation.soft_visual_hull.carried`."""
+    """See `tracking3d.segmentation.soft_visual_hull.sample_grid_distances`."""
     z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
     u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
     if (depth <= _NEAR).any():

@@ -11,7 +11,7 @@ from recorded_runs import append_lines, frame_of
 
 from tracking3d.results import drawing
 from tracking3d.video import open_source
-from tracking3d.viewer import timeline, viewer
+from tracking3d.viewer import descriptions, timeline
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
 from tracking3d.viewer.run_images import LatestImages, OverlayPictures, images_of_run
@@ -88,9 +88,9 @@ def test_a_frame_that_is_not_at_hand_is_said_to_be_so(follower):
 
 def test_what_a_run_says_is_text_and_never_markup(follower):
     pages = [
-        viewer.list_doubtful_frames([follower, follower]),
-        viewer.describe_frame(follower, follower.frames[5]),
-        viewer.describe_frame(follower, None),
+        descriptions.list_doubtful_frames([follower, follower]),
+        descriptions.describe_frame(follower, follower.frames[5]),
+        descriptions.describe_frame(follower, None),
     ]
     for page in pages:
         tags = Tags(page)
@@ -112,15 +112,15 @@ def test_what_a_run_says_is_text_and_never_markup(follower):
 )
 def test_a_description_of_any_kind_is_told_as_text(follower, fault):
     follower.description = {**follower.description, **fault}
-    page = Tags(viewer.about(follower))
+    page = Tags(descriptions.about(follower))
     assert page.names <= {"div", "b", "table", "tr", "td", "p"} and "a <run>" in page.text
 
 
 def test_the_list_names_frames_status_and_reason_of_every_range(follower):
-    text = Tags(viewer.list_doubtful_frames([follower])).text
+    text = Tags(descriptions.list_doubtful_frames([follower])).text
     assert "uncertain frames 3 to 4: points" in text and "lost frame 8: no reason given" in text
     follower.frames = {0: follower.frames[0]}
-    assert "No frame is uncertain or lost" in viewer.list_doubtful_frames([follower])
+    assert "No frame is uncertain or lost" in descriptions.list_doubtful_frames([follower])
 
 
 def test_the_timeline_of_a_long_run_stays_small(run):
@@ -134,7 +134,7 @@ def test_the_timeline_of_a_long_run_stays_small(run):
     assert len(points) <= 1400
     lowest = min(float(point.split(",")[1]) for point in points)
     assert lowest == min(float(p.split(",")[1]) for p in points if abs(float(p.split(",")[0]) - 500) < 2)
-    assert len(viewer.list_doubtful_frames([follower])) < 200_000
+    assert len(descriptions.list_doubtful_frames([follower])) < 200_000
 
 
 def test_every_quantity_of_the_run_can_be_plotted(follower):

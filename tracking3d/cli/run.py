@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,6 +73,14 @@ def run(
     folder = output.out or default_folder(source)
     check_known(config, len(prompts), performance.split is not None)
     check_extended(config, len(prompts), performance.split is not None)
+    if (
+        not prompts
+        and needs_prompt(config)
+        and config.tracker.name == "auto"
+        and _holds_cut_outs(source, quiet)
+    ):
+        prompt = replace(prompt, masks=Path(source))
+        config = _configure(prompt, camera, tracking, settings, output, performance)
     asks = not prompts and needs_prompt(config)
     if asks and (not a_person_is_there() or quiet or output.resume or source.isdigit()):
         raise InputError(
@@ -93,6 +102,20 @@ def run(
     typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
     with closing(open_picker(request, menu)) as page:
         track_picked(page, request, display, start)
+
+
+def _holds_cut_outs(source: str, quiet: bool) -> bool:
+    """Whether the images' alpha says where the object is, and a note that it does."""
+    from tracking3d.trackers.mask_files import holds_cut_outs
+
+    found = holds_cut_outs(source)
+    if found and not quiet:
+        typer.echo(
+            f"The alpha of the images in {source} is taken as the object's masks; to have it tracked instead, give "
+            "--tracker, --box, --mask, --points or --masks.",
+            err=True,
+        )
+    return found
 
 
 def _configure(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.online import PointAnswers
+from tracking3d.points.answers import PointAnswers
 from tracking3d.runtime.stage_times import StageTimes
 
 

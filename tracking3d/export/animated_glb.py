@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tracking3d.export.axes import HALF_TURN, continuous, quaternion
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.mesh import OBJECT_NODE
+from tracking3d.geometry.gltf_axes import OBJECT_NODE
 from tracking3d.results.mesh_export import glb_file
 
 CAMERA_NODE = "tracking3d_camera"

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.mesh import Mesh, sound_mesh_file
+from tracking3d.geometry.mesh import Mesh
+from tracking3d.geometry.mesh_checks import sound_mesh_file
 
 LONGEST_EDGE = 0.25
 """A user's mesh is refined until its edges are shorter than this, in units of its radius."""

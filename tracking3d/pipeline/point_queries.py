@@ -13,8 +13,9 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame
 from tracking3d.pipeline.session import Session
+from tracking3d.points.answers import PointAnswers
 from tracking3d.points.image_only import UncoveredPoints
-from tracking3d.points.online import CausalPoints, PointAnswers
+from tracking3d.points.online import CausalPoints
 from tracking3d.points.pictures import open_picture
 from tracking3d.points.view import open_view
 

@@ -117,7 +117,7 @@ class Retracking:
             return None
         record = self._causal[index]
         return replace(
-            record, T_cam_obj=self._predict(record), camera=None, revision=True, refined=True, seconds=0.0,
+            record, T_cam_obj=self.predict(record), camera=None, revision=True, refined=True, seconds=0.0,
             stages=StageTimes(),
         )  # fmt: skip
 
@@ -136,7 +136,7 @@ class Retracking:
         self._before = None
         try:
             return self._session.refine_frame(
-                frame, self._masks.of(frame), self._predict(self._causal[frame.index])
+                frame, self._masks.of(frame), self.predict(self._causal[frame.index])
             )
         except PluginError:
             if self._session.config.runtime.on_plugin_failure == "stop":
@@ -148,7 +148,8 @@ class Retracking:
         with self._session.state_unchanged():
             return self.take(frame)
 
-    def _predict(self, causal: FrameRecord) -> NDArray[np.float64]:
+    def predict(self, causal: FrameRecord) -> NDArray[np.float64]:
+        """The pose ``(4, 4)`` that a causal estimate amounts to once the keyframes are refined."""
         if self._start is None:
             return causal.T_cam_obj
         return self._start.predict(causal.index, causal.T_cam_obj, causal.through(self._camera).fx)

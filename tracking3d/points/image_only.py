@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.points.answers import PointAnswers
 from tracking3d.points.image_following import ImageAnswers, ImageFollower
-from tracking3d.points.online import KEPT, PointAnswers
+from tracking3d.points.online import KEPT
 from tracking3d.points.pictures import Picture
 from tracking3d.points.view import Array
 

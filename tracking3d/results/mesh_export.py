@@ -23,7 +23,7 @@ from PIL import Image as PillowImage
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.geometry.mesh import OBJECT_NODE, UNSEEN_MATERIAL, UPRIGHT_NODE, UPRIGHT_ROTATION
+from tracking3d.geometry.gltf_axes import OBJECT_NODE, UNSEEN_MATERIAL, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import first_problem, image_file, write_atomic, write_together
 from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 from tracking3d.runtime.array_files import ArrayFile

@@ -19,7 +19,6 @@ _ROOMS = {"benchmark", "datasets", "evaluation", "speed", "synthesis", "vot"}
 
 _ELSEWHERE = {
     "tracking3d.config.solvers": "tracking3d.config.models",
-    "tracking3d.points.answers": "tracking3d.points.online",
     "tracking3d.datasets.region_files": "tracking3d.trackers.region_files",
     "tracking3d.datasets.region_tracker": "tracking3d.trackers.region_tracker",
     "tracking3d.speed.kernels_ahead": "tracking3d.runtime.kernels_ahead",

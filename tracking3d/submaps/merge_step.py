@@ -62,7 +62,13 @@ from tracking3d.submaps.job import Tell
 from tracking3d.submaps.merged_run import PartRun, move_refined_estimates, write_causal_mesh, write_merged_run
 from tracking3d.submaps.plan import PARTS, Plan, part_folder, put_cut_mask, remove_parts
 from tracking3d.submaps.plan_step import Begun
-from tracking3d.submaps.submap_runs import PartJob, Revisit, resume_retracking, resume_submap
+from tracking3d.submaps.submap_runs import (
+    PartJob,
+    Revisit,
+    frames_with_the_one_before,
+    resume_retracking,
+    resume_submap,
+)
 from tracking3d.video import open_source
 from tracking3d.video.source import parse_selection
 
@@ -534,9 +540,8 @@ def adjust_poses(tell: Tell, job: Placing) -> tuple[list[FrameRecord], dict[int,
     estimates = _estimates(job.job.folder, job.look.camera)
     retracking = resume_retracking(job.job, *resume_submap(job.job))
     last = RefinementSteps(estimates, job.look, retracking=retracking)
-    found, own = list[FrameRecord](), parse_selection(job.job.selection)
-    before = max(own.start - own.step, parse_selection(job.job.whole).start)
-    for frame in _frames(job.job.source, f"{before}:{own.stop}:{own.step}", estimates):
+    found, (own, selection) = list[FrameRecord](), frames_with_the_one_before(job.job)
+    for frame in _frames(job.job.source, selection, estimates):
         if frame.index in own:
             found.append(last.adjust(frame))
         elif (record := estimates.estimate(frame.index)).refined:

@@ -25,7 +25,7 @@ from tracking3d.results.files import read_mask, writing
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates, keep_masks, write_refined
 from tracking3d.results.run_reader import RunReader
-from tracking3d.video import open_source
+from tracking3d.video import open_source, parse_selection
 from tracking3d.video.source import FrameSource
 
 Tell = Callable[[Any], None]
@@ -96,12 +96,16 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
     kept, session = resume_submap(job)
     retracking = resume_retracking(job, kept, session)
     causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
+    own, selection = frames_with_the_one_before(job)
     with writing(job.out):
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
     count = 0
     with (job.out / layout.FRAMES).open("wb") as lines:
-        for frame in read_timed(open_source(job.source, job.selection)):
+        for frame in read_timed(open_source(job.source, selection)):
             if not isinstance(frame, Frame) or frame.index not in causal:
+                continue
+            if frame.index not in own:  # its landmarks are followed into the first frame
+                retracking.pass_over(frame, retracking.predict(causal[frame.index]))
                 continue
             record_ = _refine_estimate(retracking, job, frame, causal[frame.index])
             if record_ is not None:
@@ -110,6 +114,13 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
                 count += 1
             tell(record_ or causal[frame.index])
     return count
+
+
+def frames_with_the_one_before(job: Revisit) -> tuple[range, str]:
+    """The frames that are looked at, and a selection of them and of the frame before, where there is one."""
+    own = parse_selection(job.selection)
+    before = max(own.start - own.step, parse_selection(job.whole).start)
+    return own, f"{before}:{own.stop}:{own.step}"
 
 
 def resume_submap(job: Revisit) -> tuple[SavedState, Session]:

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.runtime.array_files import ArrayFile, ArrayHeader, ArrayTooLargeError
-from tracking3d.trackers.mask_images import ImageMasks, UnreadableMaskError, binarize, natural_key, of_objects
+from tracking3d.trackers.mask_images import (
+    ImageMasks,
+    UnreadableMaskError,
+    binarize,
+    is_cut_out,
+    natural_key,
+    of_objects,
+)
 from tracking3d.trackers.vot_regions import RegionMasks
 
 __all__ = ["ImageMasks", "MaskFiles", "UnreadableMaskError", "natural_key", "open_masks"]
@@ -26,6 +33,7 @@ _SUFFIXES = frozenset((
     ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp",
 ))
 # fmt: on
+_PROBES = 24  # images that are read to know whether a folder holds cut-outs (chosen)
 
 
 class MaskFiles(Protocol):
@@ -73,6 +81,13 @@ def open_masks(path: Path, object: int | None = None) -> MaskFiles:
     if suffix == ".txt":
         return RegionMasks(path)
     return ArrayMasks(path) if suffix in (".npy", ".npz") else VideoMasks(path)
+
+
+def holds_cut_outs(source: str) -> bool:
+    """Whether a folder's images have alpha that says where the object is; `_PROBES` of them are read."""
+    folder = Path(source)
+    files = sorted(filter(_is_image, folder.iterdir())) if folder.is_dir() else []
+    return bool(files) and all(is_cut_out(files[place * len(files) // _PROBES]) for place in range(_PROBES))
 
 
 def _of_one_video(path: Path) -> Path:

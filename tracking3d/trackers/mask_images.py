@@ -150,11 +150,26 @@ def _numbers_in(image: Pillow.Image) -> NDArray:
     return np.asarray(image)
 
 
+def is_cut_out(file: Path) -> bool:
+    """Whether an image's alpha says where its object is; False if it cannot be read."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Pillow.open(file) as image:
+            return _alpha_in(image) is not None
+    except Exception:  # decoders raise whatever a damaged file leads them to
+        return False
+
+
+def _alpha_in(image: Pillow.Image) -> NDArray[np.uint8] | None:
+    """``(H, W)`` alpha, also a palette's; None if there is none or it is the same everywhere, which says nothing."""
+    if not image.has_transparency_data:
+        return None
+    alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    return alpha if alpha.min() != alpha.max() else None
+
+
 def _object_in(image: Pillow.Image) -> NDArray[np.bool_]:
-    if image.has_transparency_data and image.mode != "P":
-        alpha = np.asarray(image.convert("RGBA"))[..., 3]
-        if alpha.min() != alpha.max():  # a cut-out; an alpha channel of one value says nothing
-            return alpha > 127
+    if (alpha := _alpha_in(image)) is not None:
+        return alpha > 127
     if image.mode == "P":
         return np.asarray(image.convert("RGB")).max(axis=2) > 0
     if image.mode == "I":  # 32-bit integers are how Pillow holds some 16-bit files

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import html
 import io
-import json
-import re
 import threading
 import time
 from bisect import bisect_left
@@ -13,7 +11,6 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,17 +18,15 @@ import viser
 from numpy.typing import NDArray
 
 from tracking3d.errors import Tracking3dError
-from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Image
-from tracking3d.results import drawing, layout
-from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
+from tracking3d.results import layout
+from tracking3d.results.doubtful_frames import doubtful_ranges
 from tracking3d.results.drawing import Colour
 from tracking3d.results.overlay import ObjectAxes
-from tracking3d.results.records import FrameRecord
-from tracking3d.runtime.array_files import ArrayFile
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
 from tracking3d.viewer.correcting import Corrections
+from tracking3d.viewer.descriptions import about, describe_frame, list_doubtful_frames
 from tracking3d.viewer.first_look import (
     ASPECT,
     FOV,
@@ -42,12 +37,11 @@ from tracking3d.viewer.first_look import (
     radius_of,
     stack_objects,
 )
-from tracking3d.viewer.followed_run import FollowedRun
+from tracking3d.viewer.followed_run import FollowedRun, landmarks_of_checkpoint
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.panel import SPEEDS, Panel
 from tracking3d.viewer.picture import axes_of, beside, draw_picture
 from tracking3d.viewer.scene import ObjectScene, set_up_space
-from tracking3d.viewer.timeline import hexadecimal, jump
 from tracking3d.web.access import Access
 
 POLL = 0.5
@@ -398,120 +392,6 @@ def look_through(
             client.camera.fov = float(2 * np.arctan(wider * np.tan(np.radians(fov) / 2)))
 
 
-_LARGEST_STATE = 2**26  # bytes of the state's text
-_LARGEST_ARRAY = 2**28
-_MOST = 200_000
-_ARRAY = re.compile(r"\d{8,}\.npz")
-
-
-def landmarks_of_checkpoint(folder: Path) -> NDArray[np.float32] | None:
-    """The landmarks ``(N, 3)`` of a run that goes on or was stopped, in object coordinates; None if none are kept.
-
-    Args:
-        folder: The run folder.
-    """
-    state = folder / layout.STATE
-    try:
-        path = state / layout.STATE_FILE
-        if path.stat().st_size > _LARGEST_STATE:
-            return None
-        session = dict(json.loads(path.read_bytes())["session"]["dict"])
-        name = session["solver"]["fields"]["known"]["fields"]["landmarks"]["file"]
-        if not _ARRAY.fullmatch(name):
-            return None
-        with ArrayFile(state / name) as arrays:
-            points = np.asarray(arrays.read("array", _LARGEST_ARRAY), np.float32)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        RecursionError,
-    ):  # of another solver, none yet, or just being replaced
-        return None
-    if points.ndim != 2 or points.shape[1] != 3:
-        return None
-    points = points[np.isfinite(points).all(axis=1)][:_MOST]
-    return points if len(points) else None
-
-
 # Descriptions as HTML: a frame's estimate, the uncertain and lost frames, the run as a whole.
 #
 # All of it is text of files, and escaped.
-
-LONGEST_LIST = 200
-"""Maximum entries in the list of uncertain and lost frames; the rest is only counted."""
-
-
-def list_doubtful_frames(runs: Sequence[FollowedRun]) -> str:
-    """The uncertain and lost frames of all runs with their reasons; a click goes to a frame."""
-    rows = [(run, doubtful) for run in runs for doubtful in doubtful_ranges(list(run.frames.values()))]
-    items = "".join(_row(run, doubtful, len(runs) > 1) for run, doubtful in rows[:LONGEST_LIST])
-    if not rows:
-        items = "<p>No frame is uncertain or lost.</p>"
-    elif len(rows) > LONGEST_LIST:
-        items += f"<p>… and {len(rows) - LONGEST_LIST} more.</p>"
-    return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{items}</div>'
-
-
-def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
-    """One run's estimate of a frame in a line of HTML, after the colour of its curve."""
-    name = html.escape(run.name)
-    if colour is not None:
-        name = f'<span style="color:{hexadecimal(colour)}">▬</span> {name}'
-    if record is None:
-        return f"<div><b>{name}</b> has no estimate for this frame</div>"
-    figures = f"confidence {record.confidence:.2f}"
-    if record.iou_initial is not None:
-        figures += f", IoU with the initial mask {record.iou_initial:.2f}"
-    details = [figures, *(["keyframe"] if record.keyframe else []), *(["refined"] if record.refined else [])]
-    why = [html.escape(text) for text in (record.reason, record.failure) if text]
-    return (
-        f"<div><b>{name}</b> {_badge(record.status)} {', '.join(details)}"
-        f"{'<br>' if why else ''}{'; '.join(why)}</div>"
-    )
-
-
-def about(run: FollowedRun) -> str:
-    """A run's state, source, tracker and notes."""
-    description: dict[str, Any] = run.description
-    tracker = description.get("config", {}).get("tracker")
-    seconds = description.get("timings", {}).get("seconds_total")
-    rows = {
-        "state": run.reader.state_in_words,
-        "source": description.get("source"),
-        "frames": len(run.frames),
-        "mask tracker": tracker.get("name") if isinstance(tracker, dict) else None,
-        "lens": run.camera.origin,
-        "seconds": round(seconds) if isinstance(seconds, int | float) else None,
-    }
-    cells = "".join(
-        f"<tr><td style='opacity:.6;padding-right:8px;vertical-align:top'>{name}</td>"
-        f"<td style='overflow-wrap:anywhere'>{html.escape(str(value))}</td></tr>"
-        for name, value in rows.items()
-        if value not in (None, "")
-    )
-    notes = "".join(f"<p>{html.escape(str(note))}</p>" for note in description.get("notes", []))
-    return (
-        f'<div style="font-size:12px;line-height:1.35;margin:4px 12px"><b>{html.escape(run.name)}</b>'
-        f"<table>{cells}</table>{notes}</div>"
-    )
-
-
-def _badge(status: Status) -> str:
-    red, green, blue = drawing.STATUS[status]
-    return (
-        f'<span style="background:rgb({red},{green},{blue});color:#111;border-radius:3px;padding:0 5px">'
-        f"{status.value}</span>"
-    )
-
-
-def _row(run: FollowedRun, doubtful: DoubtfulRange, named: bool) -> str:
-    name = f"{html.escape(run.name)}, " if named else ""
-    going = jump(str(doubtful.first))
-    return (
-        f'<div class="streak" role="button" tabindex="0" onclick="{going}" '
-        f'onkeydown="if(event.key===\'Enter\')this.click()" style="cursor:pointer;padding:3px 0">'
-        f"{_badge(doubtful.status)} {name}<b>{doubtful.frames}</b>: "
-        f"{html.escape(doubtful.reason) or 'no reason given'}</div>"
-    )

@@ -4,7 +4,7 @@ python benchmarks/same_answers.py --revision b367a89 --only demo,fresh --frames 
 
 Both versions run in processes of their own, and only through the command line, by options that both have. Of the run
 folders only what both write under the same name is compared, so modules, settings and JSON keys may be renamed between
-the two. It exits with 1 if poses or masks differ.
+the two. It exits with 1 if poses, masks or exported files differ.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import argparse
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -42,22 +44,19 @@ TOLERANCE = 1e-9
 
 FRESH_SEED, FRESH_COUNT = 611, 2
 SEQUENCES = ("demo", "fresh", "box_in_hand", "temple_ring")
+WAYS = ("csrt", "segment", "split", "corrected", "resumed", "exports")
+"""Ways to run a clip: two trackers; with ``csrt`` in two parts, corrected, stopped and resumed, and exported."""
+FORMATS = ("tum", "colmap")
 MASKS = ("initial_masks", "causal/masks", "masks")
 
 
 @dataclass(frozen=True)
 class Version:
-    """One of the two versions that are compared.
+    """One of the two versions that are compared."""
 
-    Attributes:
-        tree: Its checkout.
-        runs: Folder of its run folders.
-        keep: Whether a finished run in there is taken as it is.
-    """
-
-    tree: Path
-    runs: Path
-    keep: bool
+    tree: Path  # its checkout
+    runs: Path  # folder of its run folders
+    keep: bool  # whether a finished run in there is taken as it is
 
     def command(self, *arguments: str | Path) -> None:
         """Run ``tracking3d`` of this version.
@@ -65,12 +64,31 @@ class Version:
         Raises:
             SystemExit: If it fails; with its error output.
         """
-        words = [sys.executable, "-m", "tracking3d", *map(str, arguments)]
+        words = self._words(*arguments)
         ended = subprocess.run(
             words, cwd=self.runs, env=self.environment(), capture_output=True, text=True, check=False
         )
         if ended.returncode:
             raise SystemExit(f"{' '.join(words)} failed in {self.tree}:\n{ended.stderr[-4000:]}")
+
+    def stop(self, run: Path, frames: int, *arguments: str | Path) -> None:
+        """Run ``tracking3d`` of this version, and stop it once the run folder has lines of that many frames.
+
+        Raises:
+            SystemExit: If it ends before.
+        """
+        words, lines = self._words(*arguments), run / "frames.jsonl"
+        with subprocess.Popen(
+            words, cwd=self.runs, env=self.environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as process:
+            while not lines.exists() or lines.read_bytes().count(b"\n") < frames:
+                if process.poll() is not None:
+                    raise SystemExit(f"{' '.join(words)} ended before it could be stopped, in {self.tree}.")
+                time.sleep(0.1)
+            process.send_signal(signal.SIGTERM)
+
+    def _words(self, *arguments: str | Path) -> list[str]:
+        return [sys.executable, "-m", "tracking3d", *map(str, arguments)]
 
     def environment(self) -> dict[str, str]:
         """What its processes see: its own modules and entry points, and nothing that makes two of its runs differ."""
@@ -98,15 +116,11 @@ class Version:
 
 @dataclass(frozen=True)
 class Sequence:
-    """What both versions are run on.
+    """What both versions are run on."""
 
-    Attributes:
-        name: What the table calls it.
-        clip: Folder with ``frames/`` and ``init.json``; None for the demo, which makes its own.
-    """
-
-    name: str
-    clip: Path | None = None
+    name: str  # what the table calls it
+    clip: Path | None = None  # folder with frames/ and init.json; None for the demo, which makes its own
+    way: str = "csrt"  # one of `WAYS`
 
     def run(self, version: Version, frames: int | None) -> Path:
         """Track it with one version.
@@ -128,39 +142,65 @@ class Sequence:
             if self.clip is None:
                 version.command("demo", "--out", folder, "--quiet")
             else:
-                box = json.loads((self.clip / "init.json").read_text())["bbox_xywh"]
-                words: list[str | Path] = ["--box", ",".join(map(str, box)), "--out", folder, "--quiet"]
-                words += [] if frames is None else ["--frames", f"0:{frames}"]
-                version.command("run", self.clip / "frames", *words)
+                self._track(version, self.clip, folder, frames)
             finished.touch()
         return folder / "run" if self.clip is None else folder
+
+    def _track(self, version: Version, clip: Path, folder: Path, frames: int | None) -> None:
+        box = json.loads((clip / "init.json").read_text())["bbox_xywh"]
+        shape = ",".join(map(str, box))
+        count = len(list((clip / "frames").iterdir())) if frames is None else frames
+        tracker = "segment" if self.way == "segment" else "csrt"
+        run: list[str | Path] = [
+            "run",
+            clip / "frames",
+            "--box",
+            shape,
+            "--out",
+            folder,
+            "--quiet",
+            "--frames",
+            f"0:{count}",
+        ]
+        run += ["--tracker", tracker, "--features", "rgb"]
+        if self.way == "split":
+            version.command(*run, "--fps", "10", "--split", str(count / 20), "--workers", "1")
+        elif self.way == "resumed":
+            version.stop(folder, count // 2, *run)
+            version.command("run", "--resume", "--out", folder, "--quiet")
+        else:
+            version.command(*run)
+        if self.way == "corrected":
+            version.command("correct", folder, f"{count // 2}:{_box_of_mask(folder, count // 2)}", "--quiet")
+        for name in FORMATS if self.way == "exports" else ():
+            version.command("export", folder, "--to", name, "--out", folder / "exported" / name, "--quiet")
+
+
+def _box_of_mask(run: Path, index: int) -> str:
+    """The box of a frame's mask, as a user would draw it; it is a correction of nothing, but computed as one."""
+    mask = cv2.imread(str(run / f"masks/{index:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    if mask is None or not mask.any():
+        raise SystemExit(f"{run} has no mask of frame {index}, which its correction would start from.")
+    return ",".join(map(str, cv2.boundingRect(mask)))
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far two runs of a sequence differ.
+    """How far two runs of a sequence differ."""
 
-    Attributes:
-        causal: The largest difference of an entry of a causal pose; infinite if one has a pose that the other lacks.
-        refined: The same of refined poses.
-        frames: How many frames have a pose, and how many of those a refined one.
-        pixels: How many pixels of masks differ, in all folders of masks.
-        masks: How many masks were compared.
-        vertices: The largest difference of a coordinate of a vertex of the mesh; infinite if the numbers differ.
-        remarks: What is missing on one side.
-    """
-
-    causal: float
-    refined: float
-    frames: tuple[int, int]
-    pixels: int
-    masks: int
-    vertices: float
-    remarks: list[str] = field(default_factory=list)
+    causal: float  # the largest difference of an entry of a causal pose; infinite if one run lacks the pose
+    refined: float  # the same of refined poses
+    frames: tuple[int, int]  # how many frames have a pose, and how many of those a refined one
+    pixels: int  # how many pixels of masks differ, in all folders of masks
+    masks: int  # how many masks were compared
+    vertices: float  # the largest difference of a coordinate of a vertex; infinite if the numbers of vertices differ
+    remarks: list[str] = field(
+        default_factory=list
+    )  # what is missing on one side, and exported files that differ
 
     @property
     def same(self) -> bool:
-        """Whether poses and masks are the same and there are some."""
+        """Whether poses, masks and exports are the same and there are some."""
         poses = max(self.causal, self.refined) <= TOLERANCE
         return poses and not self.pixels and not self.remarks and min(self.frames[0], self.masks) > 0
 
@@ -172,6 +212,7 @@ def compare(before: Path, after: Path) -> Difference:
     causal, refined = (pose_difference(*pair) for pair in poses)
     pixels, masks = mask_difference(before, after, remarks)
     vertices = array_difference(read_vertices(before), read_vertices(after))
+    remarks += [f"{name} differs" for name in exports_that_differ(before, after)]
     return Difference(causal, refined, (len(poses[0][0]), len(poses[1][0])), pixels, masks, vertices, remarks)
 
 
@@ -225,6 +266,21 @@ def read_vertices(run: Path) -> np.ndarray:
     return np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
 
 
+def exports_that_differ(before: Path, after: Path) -> list[str]:
+    """Names of exported files that one run lacks or that differ in a byte; runs without exports have none."""
+    files = [
+        {file.relative_to(run): file for file in sorted((run / "exported").rglob("*")) if file.is_file()}
+        for run in (before, after)
+    ]
+    names = sorted(files[0].keys() | files[1].keys())
+    return [
+        str(name)
+        for name in names
+        if not (name in files[0] and name in files[1])
+        or files[0][name].read_bytes() != files[1][name].read_bytes()
+    ]
+
+
 @contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Path]:
     """A temporary worktree of a revision."""
@@ -247,9 +303,15 @@ def git(*words: str) -> str:
     return ended.stdout.strip()
 
 
-def find_sequences(only: list[str], data: Path, before: Version, clips: Path) -> list[Sequence]:
+def find_sequences(
+    only: list[str], ways: list[str], data: Path, before: Version, clips: Path
+) -> list[Sequence]:
     """The sequences to track; those of the suite ``fresh`` are rendered once, by the earlier version."""
     found: list[Sequence] = []
+
+    def add(name: str, clip: Path) -> None:
+        found.extend(Sequence(name if way == "csrt" else f"{name}-{way}", clip, way) for way in ways)
+
     for name in only:
         if name == "demo":
             found.append(Sequence("demo"))
@@ -257,9 +319,10 @@ def find_sequences(only: list[str], data: Path, before: Version, clips: Path) ->
             suite = clips / f"fresh-{FRESH_SEED}"
             words = ["--suite", "fresh", "--seed", str(FRESH_SEED), "--count", str(FRESH_COUNT), "--quiet"]
             before.command("synth", *words, suite)
-            found += [Sequence(clip.parent.name, clip.parent) for clip in sorted(suite.glob("*/init.json"))]
+            for clip in sorted(suite.glob("*/init.json")):
+                add(clip.parent.name, clip.parent)
         elif (data / name / "init.json").exists():
-            found.append(Sequence(name, data / name))
+            add(name, data / name)
         else:
             print(f"{name}: left out, as {data} has no such clip.")
     return found
@@ -285,7 +348,7 @@ def main() -> None:
             after = Version(ROOT, out / "working_tree", keep=False)
             before.check()
             after.check()
-            sequences = find_sequences(given.only, given.data.resolve(), before, out / "clips")
+            sequences = find_sequences(given.only, given.ways, given.data.resolve(), before, out / "clips")
             print(
                 f"{'':36}   frames       largest difference of   masks and pixels   largest of\n"
                 f"{f'{revision[:12]} and the working tree':36}  all refined    causal   refined    all   differ"
@@ -311,6 +374,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument(
         "--only", default=",".join(SEQUENCES), help=f"of {', '.join(SEQUENCES)}; all if left out"
     )
+    parser.add_argument("--ways", default=",".join(WAYS), help=f"of {', '.join(WAYS)}; all if left out")
     parser.add_argument("--frames", type=int, help="frames of each sequence; the demo has its own 36")
     parser.add_argument(
         "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of real clips"
@@ -328,9 +392,11 @@ def arguments() -> argparse.Namespace:
     """What the command line says."""
     parser = options()
     given = parser.parse_args()
-    given.only = [name.strip() for name in given.only.split(",")]
-    if unknown := set(given.only) - set(SEQUENCES):
-        parser.error(f"--only {','.join(sorted(unknown))}: there are {', '.join(SEQUENCES)}")
+    for option, known in (("only", SEQUENCES), ("ways", WAYS)):
+        names = [name.strip() for name in getattr(given, option).split(",")]
+        if unknown := set(names) - set(known):
+            parser.error(f"--{option} {','.join(sorted(unknown))}: there are {', '.join(known)}")
+        setattr(given, option, names)
     return given
 
 

@@ -49,7 +49,8 @@ Masks = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR|FILE[@N]",
-        help="Masks of all frames: a folder, video, .npz, COCO .json or VOT .txt. The first mask is the prompt.",
+        help="Masks of all frames: a folder, video, .npz, COCO .json or VOT .txt. The first mask is the prompt. "
+        "Images with alpha bring their own.",
         rich_help_panel=PROMPT,
     ),
 ]

@@ -113,10 +113,8 @@ class MeshFile:
         Raises:
             InputError: If it is not a readable mesh.
         """
-        from tracking3d.geometry.mesh import (
-            read_mesh_file,  # slow to import
-            what_is_wrong,
-        )
+        from tracking3d.geometry.gltf_axes import read_mesh_file
+        from tracking3d.geometry.mesh_checks import what_is_wrong
 
         try:
             mesh = read_mesh_file(self.path)
