@@ -4,7 +4,7 @@
 left in ``BENCHMARK/runs`` (of any masks: trackers' ones say how they err, exact ones that they are to be kept), goes
 over their frames as the final refinement does, asks at pixels near the outlines, and some elsewhere, what the sources
 of `tracking3d.segmentation.whole_video` say and whether the object is there, fits a logistic regression
-without a constant, and writes ``tracking3d/segmentation/whole_video.py``. ``FOLDER`` holds the sequences. Runs
+without a constant, and writes ``tracking3d/segmentation/whole_video_weights.py``. ``FOLDER`` holds the sequences. Runs
 with exact masks count as much as all others together.
 """
 

@@ -17,7 +17,6 @@ from tracking3d.segmentation.motion_cue import background_motion, flow_distance,
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import TemporalNeighbours
 from tracking3d.segmentation.whole_video import (
-    WEIGHTS,
     PixelEvidence,
     VideoSegmenter,
     alignment,
@@ -25,6 +24,7 @@ from tracking3d.segmentation.whole_video import (
     edge_strength,
     segment_all,
 )
+from tracking3d.segmentation.whole_video_weights import WEIGHTS
 from tracking3d.trackers.outline import inside_distance
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)

@@ -33,6 +33,7 @@ from tracking3d.segmentation.motion_cue import motion_cue
 from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, shape_log_odds
 from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.segmentation.temporal_neighbours import REACH, TemporalNeighbours
+from tracking3d.segmentation.whole_video_weights import WEIGHTS
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.outline import inside_distance
 
@@ -416,61 +417,3 @@ class PixelEvidence:
             return 2.0
         difference = outline_difference(self.distances["initial"], drawn)
         return 2.0 if difference is None else min(difference / _APART, 2.0)
-
-
-WEIGHTS = {
-    "initial, near": 0.145,
-    "initial, at the outline": 1.145,
-    "initial, near on edges": -0.105,
-    "initial, at the outline on edges": 0.254,
-    "initial, near on edges as a whole": -0.510,
-    "initial, at the outline on edges as a whole": -0.142,
-    "initial, deep": 0.230,
-    "answer, near": -0.238,
-    "answer, at the outline": -0.004,
-    "answer, near on edges": 0.168,
-    "answer, at the outline on edges": 0.545,
-    "answer, near on edges as a whole": -0.207,
-    "answer, at the outline on edges as a whole": 0.033,
-    "answer, near by confidence": 0.703,
-    "answer, at the outline by confidence": 0.571,
-    "answer, deep": -0.470,
-    "drawn, near": 0.178,
-    "drawn, at the outline": 0.141,
-    "drawn, near on edges": -0.100,
-    "drawn, at the outline on edges": 0.194,
-    "drawn, near on edges as a whole": 0.129,
-    "drawn, at the outline on edges as a whole": 0.149,
-    "drawn, near by confidence": -0.461,
-    "drawn, at the outline by confidence": -0.192,
-    "drawn, deep": 0.371,
-    "hull, near": -0.014,
-    "hull, at the outline": 0.046,
-    "hull, near on edges": 0.008,
-    "hull, at the outline on edges": 0.233,
-    "hull, near on edges as a whole": 0.276,
-    "hull, at the outline on edges as a whole": 0.209,
-    "hull, near by confidence": 0.157,
-    "hull, at the outline by confidence": 0.116,
-    "hull, deep": -0.122,
-    "wide hull, near": 0.355,
-    "wide hull, at the outline": 0.092,
-    "wide hull, near on edges": 0.084,
-    "wide hull, at the outline on edges": 0.331,
-    "wide hull, near on edges as a whole": 0.305,
-    "wide hull, at the outline on edges as a whole": 0.184,
-    "wide hull, near by confidence": -0.155,
-    "wide hull, at the outline by confidence": -0.321,
-    "initial, near by doubt": -0.221,
-    "initial, at the outline by doubt": 0.008,
-    "colours beside the outline": 1.071,
-    "colours beside the outline by doubt": 0.081,
-    "colours beside the outline by the initial mask's edges": 0.200,
-    "colours remembered": 0.675,
-    "colours remembered by doubt": 0.479,
-    "colours remembered by the initial mask's edges": -0.048,
-    "motion of colours": 0.788,
-    "motion of colours by doubt": 0.551,
-    "motion of fine texture": 0.697,
-    "motion of fine texture by doubt": 0.609,
-}

@@ -164,7 +164,7 @@ class Sequence:
         ]
         run += ["--tracker", tracker, "--features", "rgb"]
         if self.way == "split":
-            version.command(*run, "--fps", "10", "--split", str(count / 20), "--workers", "1")
+            version.command(*run, "--split", f"{count // 2}f", "--workers", "1")
         elif self.way == "resumed":
             version.stop(folder, count // 2, *run)
             version.command("run", "--resume", "--out", folder, "--quiet")
