@@ -19,10 +19,13 @@ from tracking3d.estimation.online.initialization.initializer import (
     try_initialize,
 )
 from tracking3d.estimation.online.map_extension import MapExtension
+from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.mapping.landmark_refinement import refine_by_landmarks
 from tracking3d.estimation.online.masks.frame_estimates import initial_estimate
 from tracking3d.estimation.online.masks.mask_agreement import measure_mask_agreement
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
@@ -33,6 +36,7 @@ _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
 _RESTARTED = "restarted"  # what the first poses come from, see `FrameEstimate.hypothesis`
+_ASKED = 4  # keyframes between two questions whether the object is a surface of revolution (chosen)
 _IN_PROGRESS = "the first map is being computed"
 Pending = tuple[Keyframe, FrameEstimate]
 """A frame that waits for the first map, and its estimate so far."""
@@ -131,6 +135,32 @@ class MapInitialization(MapExtension):
                 updated, state.revisable, _RESTARTED, state.camera, self.online, self.weights
             )
         return updated, tuple(revised)
+
+    def _find_free_axis(self, state: SolverState) -> SolverState:
+        """The state before the next frame, with a surface of revolution if its keyframes tell that it is one.
+
+        It is asked at every fourth keyframe. It takes seconds, for which a live source would wait.
+        """
+        object_map, last = state.object_map, state.object_map.keyframes[-1]
+        due = last.index == state.last_pose[1] and len(object_map.keyframes) % _ASKED == 0
+        asked = object_map.pointless and object_map.free_axis is None and not object_map.fixed_keyframes
+        if self.in_background or state.inactive_maps or not (due and asked):
+            return state
+        with in_stage("map"):
+            weights, others = FitWeights(smoothness=self.online.smoothness), [v for v, _ in state.revisable]
+            object_map = as_surface_of_revolution(object_map, weights, others)
+        if object_map.free_axis is None:
+            return state
+        last = object_map.keyframes[-1]
+        return replace(
+            state,
+            object_map=object_map,
+            surface=object_map.surface(),
+            last_pose=(last.pose, last.index),
+            previous_pose=None,
+            trajectory=((last.pose, last.index),),
+            baseline=LossBaseline(),
+        )
 
     def _initialize_in_background(
         self, state: SolverState, newest: Pending

@@ -61,6 +61,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
 from tracking3d.estimation.online.initialization.photo_tracks import Photo
 from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
+from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_points
 from tracking3d.estimation.online.mapping.keyframe_views import cut_around_object
@@ -148,6 +149,7 @@ class OnlineSolver(MapInitialization):
         if state.phase is SolverPhase.INITIALIZING:
             return self._add_pending(state, frame, image, binary)
         state, revised = self._restart_if_misfit(state)
+        state = self._find_free_axis(state)
         state, estimate = self._track(state, frame, image, binary)
         if binary is not None and needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, binary)
@@ -171,9 +173,12 @@ class OnlineSolver(MapInitialization):
         )
         object_map, camera = state.object_map, state.camera
         if object_map.pointless and not object_map.fixed_keyframes:
-            object_map = restart_without_points(
-                object_map, camera, FitWeights(smoothness=self.online.smoothness)
-            )
+            weights = FitWeights(smoothness=self.online.smoothness)
+            others = [view for view, _ in state.revisable]
+            object_map = as_surface_of_revolution(object_map, weights, others)
+            if object_map.free_axis is None:
+                object_map = restart_without_points(object_map, camera, weights)
+                object_map = as_surface_of_revolution(object_map, weights, others)
         object_map, camera = refine_globally(object_map, camera, self.online)
         if self.config.has_given_masks:
             state = replace(state, mask_agreement=mask_agreement(object_map, camera))

@@ -87,10 +87,11 @@ def make_estimate(
         hypothesis=found.hypothesis,
         iterations=fit.iterations,
         losses={"appearance": fit.appearance, "outline": fit.outline, "points": fit.points},
+        free_axis=found.evidence.free_axis,
         diagnostics={
             "inliers": float(found.evidence.inliers),
             "outlier_ratio": found.evidence.outlier_ratio,
-            "min_curvature": least_constrained_axis(fit)[0],
+            "min_curvature": least_constrained_axis(fit, found.evidence.free_axis)[0],
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": view.mask_weight,

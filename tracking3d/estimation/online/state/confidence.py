@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.optimization.observability import least_constrained_axis
@@ -55,6 +58,8 @@ class PoseEvidence:
     has_mask: bool = True  # whether there is one
     untextured: bool = False  # whether the object has no points that could be tracked
     has_texture: bool = False  # whether it has texture nevertheless, whose points were not found again
+    # (3,) in object coordinates, of a surface of revolution: rotation about it is not judged; None without one
+    free_axis: NDArray[np.float64] | None = None
 
     @property
     def is_decisive(self) -> bool:
@@ -168,7 +173,7 @@ def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
         {
             "inliers": evidence.inliers,
             "outlier_ratio": evidence.outlier_ratio,
-            "min_curvature": least_constrained_axis(fit)[0],
+            "min_curvature": least_constrained_axis(fit, evidence.free_axis)[0],
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": evidence.mask_weight,
@@ -248,5 +253,5 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
     if worst == "inliers" and evidence.untextured:
         found = "no points that last" if evidence.has_texture else "hardly any texture"
         return f"the object has {found}: its rotation is poorly constrained"
-    axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
+    axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit, evidence.free_axis)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)

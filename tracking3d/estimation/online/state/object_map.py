@@ -15,6 +15,7 @@ from torch import Tensor
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
+from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -75,6 +76,8 @@ class ObjectMap:
     # index of the newest keyframe when dense landmarks were last asked to refine the map; -1 if they never
     # were
     asked_landmarks: int = -1
+    # of an object without points that is a surface of revolution; its surface is kept one. None if it has none
+    free_axis: FreeAxis | None = None
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:
