@@ -54,8 +54,8 @@ UNALIGNED_MAP = "unaligned_map"
 the earlier one is only a guess."""
 
 
-FREE_ROTATION = "rotation about its axis is not known; the smoothest one is given"
-"""What is said wherever poses have a free axis."""
+FREE_ROTATION = "a surface of revolution: rotation about its axis is not known, the smoothest one is given"
+"""Said wherever poses of a run are told that have a `FrameEstimate.free_axis`."""
 
 
 @dataclass(frozen=True, eq=False)
