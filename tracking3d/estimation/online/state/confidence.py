@@ -164,7 +164,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
 
     Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
     of the suite ``fresh`` of seed 9101, and its intercept to further suites and real clips;
-    history/pages/method/confidence.md has its calibration on others. With a free axis, rotation about it does not count.
+    history/pages/method/confidence.md has its calibration on others.
+    Rotation about a free axis does not count.
     """
     odds = _INTERCEPT + sum(_log_odds(fit, evidence).values())
     if evidence.free_axis is not None:
