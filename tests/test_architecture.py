@@ -45,7 +45,7 @@ ROOM_LINES = {
     "config": 1500,
     "engines": 950,
     "errors": 50,
-    "estimation": 12100,
+    "estimation": 12450,
     "export": 2750,
     "features": 650,
     "frames": 150,

@@ -91,7 +91,7 @@ def make_estimate(
         diagnostics={
             "inliers": float(found.evidence.inliers),
             "outlier_ratio": found.evidence.outlier_ratio,
-            "min_curvature": least_constrained_axis(fit, found.evidence.free_axis)[0],
+            "min_curvature": least_constrained_axis(fit)[0],
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": view.mask_weight,

@@ -180,7 +180,7 @@ def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
         {
             "inliers": evidence.inliers,
             "outlier_ratio": evidence.outlier_ratio,
-            "min_curvature": least_constrained_axis(fit, evidence.free_axis)[0],
+            "min_curvature": least_constrained_axis(fit)[0],
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": evidence.mask_weight,
@@ -262,5 +262,5 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
     if worst == "inliers" and evidence.untextured:
         found = "no points that last" if evidence.has_texture else "hardly any texture"
         return f"the object has {found}: its rotation is poorly constrained"
-    axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit, evidence.free_axis)[1])
+    axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)
