@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -9,13 +12,18 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from turned_solid import degrees_apart
 
+from tracking3d.checkpoint.serialization import TreeFolder
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.map_initialization import MapInitialization
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution, find_free_axis
 from tracking3d.estimation.online.mapping.global_refinement import fit_keyframes
 from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
@@ -142,3 +150,27 @@ def test_an_untwisted_pose_shows_the_same_and_does_not_turn_about_the_axis() -> 
     assert degrees_apart(found, before) == pytest.approx(leant, abs=0.1)
     over = from_matrix(rotation_about(torch.tensor([1.0, 0.0, 0.0]), 170.0), torch.tensor([0.0, 0.0, 3.0]))
     assert axis.untwisted(over, before) is over
+
+
+def test_the_solver_asks_at_due_keyframes_of_maps_without_points_and_its_state_can_be_kept(tmp_path) -> None:
+    plain = tumbling()
+    last = plain.keyframes[-1]
+    state = SolverState(
+        CAMERA, plain, plain.surface(), (last.pose, last.index), (last.pose, 0), np.zeros((SIZE, SIZE), np.uint8),
+        FollowedPoints.none(), pending=None,
+    )  # fmt: skip
+
+    def asked(state: SolverState, in_background: bool = False) -> SolverState:
+        solver = SimpleNamespace(in_background=in_background, online=OnlineConfig())
+        return MapInitialization._find_free_axis(cast(MapInitialization, solver), state)
+
+    with_points = replace(state, object_map=replace(plain, pointless=False))
+    for one in (with_points, replace(state, last_pose=(last.pose, 9))):
+        assert asked(one) is one
+    assert asked(state, in_background=True) is state
+    found = asked(state)
+    assert degrees_off(found.object_map.free_axis) < 3 and found.previous_pose is None
+    assert found.surface is not None and torch.equal(found.surface.vertices, found.object_map.vertices)
+    kept = TreeFolder(tmp_path, OnlineSolver.state_classes)
+    axis = kept.read(json.loads(kept.text(found.object_map.free_axis)))
+    assert np.array_equal(axis.direction, found.object_map.free_axis.direction)
