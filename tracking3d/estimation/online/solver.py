@@ -217,6 +217,8 @@ class OnlineSolver(MapInitialization):
             followed = own.points.concatenate(followed)
         if state.previous_pose is not None:
             starts |= pose_predictions(state, frame.index, binary)
+        elif object_map.free_axis is not None and state.last_pose[1] == frame.index - 1:
+            starts["last"] = state.last_pose[0]  # the causal pose may be of a surface that was another one
         found = self._find(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
         before = state.last_pose if state.last_pose[1] == frame.index - 1 else None
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
