@@ -105,6 +105,22 @@ def test_few_views_or_one_with_a_handle_among_the_others_are_not_enough() -> Non
     assert find_free_axis(plain, others) is None
 
 
+def test_views_that_the_border_cuts_tell_the_axis_but_not_that_there_is_one() -> None:
+    plain = tumbling()
+
+    def cut(view: Keyframe) -> Keyframe:
+        seen, inside = view.observation, torch.ones(SIZE, SIZE)
+        inside[:, :44] = 0.0
+        return replace(view, observation=replace(seen, valid=inside, mask=seen.mask * inside))
+
+    two = replace(plain, keyframes=(*map(cut, plain.keyframes[:2]), *plain.keyframes[2:]))
+    assert degrees_off(find_free_axis(two)) < 3
+    many = replace(plain, keyframes=(*map(cut, plain.keyframes[:6]), *plain.keyframes[6:]))
+    assert find_free_axis(many) is None
+    whole = [replace(one, observation=replace(one.observation, index=80)) for one in plain.keyframes]
+    assert degrees_off(find_free_axis(many, whole)) < 6
+
+
 def test_a_wrong_surface_becomes_one_of_revolution_and_its_axis_leans_less() -> None:
     truth, generator = tumbling(), np.random.default_rng(1)
     tilted = [
