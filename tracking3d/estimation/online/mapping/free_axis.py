@@ -74,13 +74,13 @@ def find_free_axis(object_map: ObjectMap, others: Sequence[Keyframe] = ()) -> Fr
         R, t = pose_arrays(view.pose)
         mirror = _mirror(view.observation, R @ centre + t)
         views += [] if mirror is None else [(mirror, R, t)]
-    known = {view.index for view in object_map.keyframes}
-    more = (_mirror(view.observation) for view in others if view.index not in known)
-    mirrors = [mirror for mirror in (*(mirror for mirror, _, _ in views), *more) if mirror and mirror.whole]
-    if len(mirrors) < _MIN_VIEWS:
+    whole = [mirror for mirror, _, _ in views if mirror.whole]
+    if not _look_symmetric(whole):
         return None
-    symmetric = np.quantile([mirror.best for mirror in mirrors], 0.1) >= _MIN_SYMMETRY
-    if not symmetric or np.median([mirror.marked for mirror in mirrors]) > _MOST_MARKED:
+    known = {view.index for view in object_map.keyframes}
+    more = [_mirror(view.observation) for view in others if view.index not in known]
+    whole += [mirror for mirror in more if mirror is not None]
+    if len(whole) < _MIN_VIEWS or not _look_symmetric(whole):
         return None
 
     def symmetry(axes: FloatArray) -> FloatArray:
@@ -128,6 +128,13 @@ def as_surface_of_revolution(
     found = replace(found, keyframes=keyframes)
     before, overlap = (float(np.mean([fit.overlap for fit in fit_keyframes(m)])) for m in (object_map, found))
     return found if overlap >= max(_MIN_OVERLAP, before - _MOST_LOST) else free
+
+
+def _look_symmetric(mirrors: Sequence[_Mirror]) -> bool:
+    if not mirrors:
+        return True
+    symmetric = np.quantile([mirror.best for mirror in mirrors], 0.1) >= _MIN_SYMMETRY
+    return bool(symmetric and np.median([mirror.marked for mirror in mirrors]) <= _MOST_MARKED)
 
 
 def _mirror(seen: Observation, centre: FloatArray | None = None) -> _Mirror | None:
