@@ -141,6 +141,7 @@ def test_a_wrong_surface_becomes_one_of_revolution_and_its_axis_leans_less() -> 
         cosines = [abs((a.pose.R.numpy() @ direction) @ (b.pose.R.numpy() @ UPRIGHT)) for a, b in pairs]
         return float(np.degrees(np.arccos(np.clip(cosines, 0, 1))).mean())
 
+    assert as_surface_of_revolution(found, FitWeights()) is found  # it is one already
     assert lean(found.keyframes, axis.direction) < 0.6 * lean(tuple(tilted), axis.direction)
 
 

@@ -112,8 +112,8 @@ def as_surface_of_revolution(
     """
     axis = find_free_axis(object_map, others)
     free = replace(object_map, free_axis=None) if object_map.free_axis is not None else object_map
-    if axis is None:
-        return free
+    if axis is None or object_map.free_axis is not None:
+        return free if axis is None else object_map
     vertices = axis.revolved(object_map.vertices, object_map.shape.faces)
     chosen = set(np.linspace(0, len(object_map.keyframes) - 1, _MOST_VIEWS).round().astype(int).tolist())
     fitted = [view for place, view in enumerate(object_map.keyframes) if place in chosen]
