@@ -44,7 +44,7 @@ ROOM_LINES = {
     "config": 1500,
     "engines": 950,
     "errors": 50,
-    "estimation": 11500,
+    "estimation": 12000,
     "export": 2750,
     "features": 650,
     "frames": 150,

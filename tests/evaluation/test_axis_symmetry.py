@@ -10,6 +10,7 @@ from tracking3d_bench.evaluation.axis_symmetry import (
     aligned_axis_errors,
     anchored_axis_errors,
     consecutive_axis_errors,
+    tilts,
 )
 
 AXIS = np.array([0.0, 1.0, 0.0])
@@ -89,3 +90,13 @@ def test_the_median_has_no_larger_sum_than_any_axis_nearby(true):
 def test_what_has_no_error_is_refused(true, count, axis, message):
     with pytest.raises(ValueError, match=message):
         aligned_axis_errors(true[:count], true[:count], axis)
+
+
+def test_a_tilt_is_the_angle_between_named_and_true_axis_whichever_way_they_point() -> None:
+    R_est = np.stack(
+        [about([0, 0, 1], lean) @ about(AXIS, turn) for lean, turn in ((0, 10), (7, 250), (30, 90))]
+    )
+    R_true = np.repeat(np.eye(3)[None], 3, 0)
+    axes = np.array([[0, 1, 0], [0, 1, 0], [0, -1, 0]], float)
+    found = tilts(R_est, axes, R_true, [0.0, 2.0, 0.0])
+    np.testing.assert_allclose(found, [0, 7, 30], atol=1e-6)

@@ -342,11 +342,18 @@ def test_turns_about_an_axis_of_symmetry_do_not_count(write_run, clip):
     stands_still = np.stack([pose(0)] * FRAMES)
     leaning = stands_still.copy()
     leaning[4, :3, :3] = Rotation.from_rotvec([np.radians(8), 0, 0]).as_matrix()
-    scores = score_run(write_run(poses=leaning), clip)
+    plain = write_run(poses=leaning)
+    scores = score_run(plain, clip)
     assert scores.rotation_error_max_deg == pytest.approx(8)
     assert scores.rotation_error_mean_deg == pytest.approx(0.8)
     assert scores.rotation_error_anchored_median_deg == pytest.approx(0, abs=1e-6)
     assert scores.rotation_error_consecutive_median_deg == pytest.approx(0, abs=1e-6)
+    assert scores.share_axis_named == 0 and scores.axis_tilt_mean_deg is None
+    plain.rename(plain.parent / "plain")
+    named = {n: {"free_axis": (0.0, -1.0, 0.0)} for n in (3, 4)}
+    scores = score_run(write_run(poses=leaning, changes=named), clip)
+    assert scores.share_axis_named == pytest.approx(2 / FRAMES)
+    assert scores.axis_tilt_mean_deg == pytest.approx(4) and scores.axis_tilt_max_deg == pytest.approx(8)
 
 
 @pytest.mark.parametrize("axis", [{}, {"direction": [0, 0, 0]}, {"direction": [1, 2]}, {"direction": "y"}, 3])
@@ -401,7 +408,8 @@ def test_without_true_masks_the_mask_figures_are_unknown(write_run, clip):
         mask.unlink()
     scores = score_run(write_run(), clip)
     assert all(unknown(scores, MaskScores)) and scores.frames_with_mask == 0
-    assert unknown(scores, PoseScores).count(True) == 1  # the clip does not return to its first view
+    # The clip does not return to its first view, and the object has no axis.
+    assert unknown(scores, PoseScores).count(True) == 3
 
 
 def test_frames_without_a_true_mask_do_not_count_for_the_masks(write_run, clip):

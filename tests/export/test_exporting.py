@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError, OutputError
+from tracking3d.estimation.estimate import FREE_ROTATION
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporting import export_run
 from tracking3d.export.formats import FORMATS
@@ -295,6 +296,18 @@ def test_what_can_do_without_images_is_exported_without_them_if_the_video_is_gon
 )
 def test_a_video_that_was_given_in_vain_is_told(run, tmp_path, to, options, note):
     assert export_run(run, to, tmp_path / "out", options=ExportOptions(**options)).note == note
+
+
+def test_exports_of_poses_say_that_a_rotation_is_not_known(run, tmp_path):
+    free = Path(shutil.copytree(run, tmp_path / "free"))
+    lines = [json.loads(line) for line in (free / "frames.jsonl").read_text().splitlines()]
+    lines[-1]["free_axis"] = [0.0, 1.0, 0.0]
+    (free / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    said = f"{FREE_ROTATION.capitalize()}."
+    assert export_run(free, "csv", tmp_path / "poses.csv").note == said
+    export_run(free, "colmap", tmp_path / "out", options=ExportOptions(images=False))
+    assert json.loads((tmp_path / "out" / "export.json").read_text())["note"] == said
+    assert export_run(free, "coco", tmp_path / "masks").note == ""
 
 
 def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):

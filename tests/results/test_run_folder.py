@@ -15,7 +15,7 @@ from forked import forked_script
 from recorded_runs import set_format
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
 from tracking3d.results.overwrite import clear_run_folder
@@ -145,6 +145,16 @@ def test_a_revision_replaces_the_earlier_answer(tmp_path, turning_sphere, start_
         == (third.mask & first.initial_mask).sum() / (third.mask | first.initial_mask).sum()
     )
     assert run.description["counts"]["uncertain"] == 0
+
+
+def test_a_free_axis_is_in_the_line_and_told_in_the_notes(tmp_path, turning_sphere, start_run):
+    free = dataclasses.replace(turning_sphere.estimates[1], free_axis=np.array([0.0, 0.6, -0.8]))
+    with start_run(tmp_path, turning_sphere) as writer:
+        writer.write(turning_sphere.estimates[0], turning_sphere.frames[0])
+        writer.write(free, turning_sphere.frames[1])
+    run = RunReader(tmp_path)
+    assert [record.free_axis for record in run.frames] == [None, (0.0, 0.6, -0.8)]
+    assert FREE_ROTATION in run.description["notes"]
 
 
 def test_what_is_not_a_number_is_null(tmp_path, turning_sphere, start_run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from html.parser import HTMLParser
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from recorded_runs import append_lines, frame_of
 
+from tracking3d.estimation.estimate import FREE_ROTATION
 from tracking3d.results import drawing
 from tracking3d.video import open_source
 from tracking3d.viewer import descriptions, timeline
@@ -97,6 +99,12 @@ def test_what_a_run_says_is_text_and_never_markup(follower):
         assert tags.names <= {"div", "b", "br", "span"}
         assert "a <run>" in tags.text and "alert" not in "".join(re.findall("<[^>]*>", page))
     assert "<b onclick='alert(1)'>too few</b> points" in Tags(pages[0]).text
+
+
+def test_a_rotation_that_is_not_known_is_said(follower):
+    record = dataclasses.replace(follower.frames[0], free_axis=(0.0, 1.0, 0.0))
+    assert FREE_ROTATION in Tags(descriptions.describe_frame(follower, record)).text
+    assert FREE_ROTATION not in Tags(descriptions.describe_frame(follower, follower.frames[0])).text
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,10 @@ UNALIGNED_MAP = "unaligned_map"
 the earlier one is only a guess."""
 
 
+FREE_ROTATION = "a surface of revolution: rotation about its axis is not known, the smoothest one is given"
+"""Said wherever poses of a run are told that have a `FrameEstimate.free_axis`."""
+
+
 @dataclass(frozen=True, eq=False)
 class FrameEstimate:
     """The estimate for one frame.
@@ -87,6 +91,8 @@ class FrameEstimate:
             the solver learns more. None if the estimate does not say: the camera known from the first frame on.
         occluder: ``(H, W)`` bool, what the mask tracker says is in front of the object; None if it cannot tell. A
             refined mask takes in what it hides of the object.
+        free_axis: ``(3,)`` unit vector in object coordinates: the object looks the same however it is rotated about it,
+            so that this part of the pose is not known, see `FREE_ROTATION`; None without one, or before it is found.
         points: Where the points are that `tracking3d.track` was asked to follow; None if it was asked for none.
     """
 
@@ -113,6 +119,7 @@ class FrameEstimate:
     probability: NDArray[np.float32] | None = None
     diagnostics: dict[str, float] = field(default_factory=dict)
     occluder: NDArray[np.bool_] | None = None
+    free_axis: NDArray[np.float64] | None = None
 
     @property
     def visible_mask(self) -> NDArray[np.bool_]:

@@ -88,6 +88,11 @@ class ExportedRun:
         """The estimates by frame index, in order."""
         return {record.index: record for record in self.reader.frames}
 
+    @property
+    def free_axis(self) -> tuple[float, float, float] | None:
+        """An axis about which the rotation of poses is not known, as the last frame has it; None without one."""
+        return next((one.free_axis for one in reversed(self.records.values()) if one.free_axis), None)
+
     @cached_property
     def span(self) -> range:
         """The frames from the first to the last estimate, those that were skipped in between too.

@@ -66,7 +66,7 @@ class Export:
     without: tuple[int, ...]
     not_finished: str = ""  # a sentence about a run that has not come to its end; empty for one that has
     of_model: bool = False  # whether it is the model and nothing of single frames
-    # a sentence about images that are left out, or a video that was given in vain; empty if there is none
+    # what to know, in sentences: images that are left out, a video that was given in vain, a rotation that is not known
     note: str = ""
 
     @property
@@ -119,12 +119,15 @@ def export_run(
     exporter.check_available()
     check_run_folder(Path(run))
     # Only now, because they need seconds to import.
+    from tracking3d.estimation.estimate import FREE_ROTATION
     from tracking3d.export.exported_run import ExportedRun
     from tracking3d.results.run_reader import RunReader
 
     reader = RunReader(Path(run), refined=options.answers == "final")
     options, note = _without_video(exporter, options, reader)
     exported = ExportedRun(reader, options)
+    if exporter.kind not in ("masks", "model", "probabilities") and exported.free_axis:
+        note = " ".join(filter(None, (note, f"{FREE_ROTATION.capitalize()}.")))
     path = reader.folder / FOLDER / exporter.default_name(exported) if out is None else Path(out).resolve()
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
@@ -135,7 +138,7 @@ def export_run(
     with _replace_when_done(path) as place:
         exporter.write(exported, place)
         if place.is_dir():
-            label = _label(exporter, exported, without)
+            label = _label(exporter, exported, without) | ({"note": note} if note else {})
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
     unit = exported.unit if "object_size" in exporter.options else None
     given = path if out is None else Path(out)

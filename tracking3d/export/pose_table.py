@@ -13,6 +13,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from tracking3d.estimation.estimate import FREE_ROTATION
 from tracking3d.export.axes import quaternion
 from tracking3d.export.exported_run import ExportedRun
 
@@ -68,6 +69,7 @@ def write_parquet(run: ExportedRun, path: Path) -> None:
     kinds = {name: pyarrow.string() for name in _TEXT} | {name: pyarrow.int64() for name in _WHOLE}
     schema = pyarrow.schema(
         [(name, kinds.get(name, pyarrow.float64())) for name in rows[0]],
-        metadata={"unit": run.unit, "axes": "OpenCV: x right, y down, z forward", "pose": "T_cam_obj"},
+        metadata={"unit": run.unit, "axes": "OpenCV: x right, y down, z forward", "pose": "T_cam_obj"}
+        | ({"free_axis": str(list(run.free_axis)), "note": FREE_ROTATION} if run.free_axis else {}),
     )
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)

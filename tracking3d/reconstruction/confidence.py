@@ -29,9 +29,9 @@ _TERMS = {  # weight, and the range that was seen
 
 def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[Assessment, dict[str, float]]:
     """The assessment of a refined estimate, and what it comes from, for the estimate's ``diagnostics``."""
-    assessment = judge_with_landmarks(
-        Assessment(estimate.status, estimate.reason, estimate.confidence), support
-    )
+    assessment = Assessment(estimate.status, estimate.reason, estimate.confidence)
+    if estimate.free_axis is None:  # no landmark rotates with a surface that looks the same from all sides
+        assessment = judge_with_landmarks(assessment, support)
     return assessment, {
         "confidence_before": estimate.confidence,
         "landmark_inliers": float(support.agreeing),

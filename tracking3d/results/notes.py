@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.estimation.estimate import FREE_ROTATION, ObjectModel
 from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.results.records import FrameRecord
 
@@ -39,6 +39,7 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
         *([advice] if advice else ()),
+        *([FREE_ROTATION] if any(one.free_axis for one in records) else ()),
         *describe_camera_and_model(run["camera"], None if advice else model),
     ]
 

@@ -39,6 +39,7 @@ _KINDS: dict[str, Any] = {
     "stages": dict | None,
     "mask_source": str | None,
     "camera": list | None,
+    "free_axis": list | None,
 }
 _MOST = 2**53  # the largest count that every reader of JSON knows exactly
 
@@ -72,6 +73,8 @@ class FrameRecord:
     camera: tuple[float, float, float, float] | None = None
     # the other numbers behind status and confidence, by name; NaN if it was not a number
     diagnostics: dict[str, float] = field(default_factory=dict)
+    # unit vector in object coordinates about which the rotation is not known; None if all of it is
+    free_axis: tuple[float, float, float] | None = None
 
     @classmethod
     def of(
@@ -104,6 +107,7 @@ class FrameRecord:
             mask_source=estimate.mask_source,
             camera=None if (c := estimate.camera) is None else (c.fx, c.fy, c.cx, c.cy),
             diagnostics={name: float(value) for name, value in estimate.diagnostics.items()},
+            free_axis=None if (a := estimate.free_axis) is None else (float(a[0]), float(a[1]), float(a[2])),
         )
 
     def through(self, camera: Camera) -> Camera:
@@ -161,6 +165,9 @@ class FrameRecord:
             if (camera := fields.get("camera")) is not None:
                 fx, fy, cx, cy = (float(value) for value in camera)
                 fields["camera"] = fx, fy, cx, cy
+            if (axis := fields.get("free_axis")) is not None:
+                x, y, z = (float(value) for value in axis)
+                fields["free_axis"] = x, y, z
             return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
         except KeyError as error:
             raise ValueError(f"{error.args[0]} is missing") from error

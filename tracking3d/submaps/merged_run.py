@@ -124,8 +124,10 @@ def _transform_records(records: Sequence[FrameRecord], similarity: Similarity) -
     if not records:
         return []
     poses = similarity.poses(np.stack([record.T_cam_obj for record in records]))
+    axes = [record.free_axis and tuple((similarity.R @ record.free_axis).tolist()) for record in records]
     return [
-        replace(record, T_cam_obj=pose, revision=False) for record, pose in zip(records, poses, strict=True)
+        replace(record, T_cam_obj=pose, free_axis=axis, revision=False)
+        for record, pose, axis in zip(records, poses, axes, strict=True)
     ]
 
 

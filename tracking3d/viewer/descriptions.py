@@ -9,7 +9,7 @@ import html
 from collections.abc import Sequence
 from typing import Any
 
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.results import drawing
 from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
 from tracking3d.results.drawing import Colour
@@ -43,7 +43,8 @@ def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour 
     if record.iou_initial is not None:
         figures += f", IoU with the initial mask {record.iou_initial:.2f}"
     details = [figures, *(["keyframe"] if record.keyframe else []), *(["refined"] if record.refined else [])]
-    why = [html.escape(text) for text in (record.reason, record.failure) if text]
+    free = FREE_ROTATION if record.free_axis else ""
+    why = [html.escape(text) for text in (record.reason, record.failure, free) if text]
     return (
         f"<div><b>{name}</b> {_badge(record.status)} {', '.join(details)}"
         f"{'<br>' if why else ''}{'; '.join(why)}</div>"

@@ -47,6 +47,7 @@ SEQUENCES = ("demo", "fresh", "box_in_hand", "temple_ring")
 WAYS = ("csrt", "segment", "split", "corrected", "resumed", "exports")
 """Ways to run a clip: two trackers; with ``csrt`` in two parts, corrected, stopped and resumed, and exported."""
 FORMATS = ("tum", "colmap")
+LEAST_PART = 24  # frames that a part of a split run has to have
 MASKS = ("initial_masks", "causal/masks", "masks")
 
 
@@ -164,7 +165,7 @@ class Sequence:
         ]
         run += ["--tracker", tracker, "--features", "rgb"]
         if self.way == "split":
-            version.command(*run, "--split", f"{count // 2}f", "--workers", "1")
+            version.command(*run, "--split", f"{max(count // 2, LEAST_PART)}f", "--workers", "1")
         elif self.way == "resumed":
             version.stop(folder, count // 2, *run)
             version.command("run", "--resume", "--out", folder, "--quiet")

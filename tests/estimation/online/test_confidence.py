@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from rendered_solids import pose_of
@@ -152,6 +153,15 @@ def test_the_reason_names_what_speaks_most_against_the_pose():
     }
     for words, (one, evidence) in against.items():
         assert words in _doubt(one, evidence), words
+
+
+def test_rotation_about_a_free_axis_is_not_judged_but_the_outline_is():
+    free = PoseEvidence(0, untextured=True, free_axis=np.array([0.0, 1.0, 0.0]))
+    loose = replace(fit(overlap=0.96, unseen=0.3), information=torch.zeros(6, 6))
+    assert assess_pose(loose, USUAL, free).status is Status.TRACKED
+    assert assess_pose(loose, USUAL, PoseEvidence(0, untextured=True)).status is Status.UNCERTAIN
+    verdict = assess_pose(fit(overlap=0.88), USUAL, free)
+    assert verdict.status is Status.UNCERTAIN and "overlap too little" in verdict.reason
 
 
 def test_a_wrong_mask_is_no_evidence_where_points_tell_that_it_is_wrong():

@@ -333,6 +333,7 @@ def transform_map(object_map: ObjectMap, similarity: Similarity) -> ObjectMap:
         vertices=torch.from_numpy(vertices).to(object_map.vertices),
         landmarks=similarity.points(object_map.landmarks),
         keyframes=tuple(keyframes),
+        free_axis=None,  # it is found again
     )
 
 
@@ -396,6 +397,7 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
         keyframes=tuple(replace(view, is_adjusted=False) for view in cull_keyframes(tuple(keyframes), most)),
         asked_landmarks=-1,
         pointless=first.pointless and second.pointless,
+        free_axis=None,
         started_at_rest=first.started_at_rest or second.started_at_rest,
     )
     return prune_landmarks(object_map, FollowedPoints.none())[0]

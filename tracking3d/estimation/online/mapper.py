@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, refine_local_map
 from tracking3d.estimation.online.mapping.local_mapping import (
@@ -22,10 +23,13 @@ from tracking3d.estimation.online.mapping.local_mapping import (
     tracks_of,
     viewing_angle,
 )
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
+from tracking3d.runtime.stage_times import in_stage
 
 _MIN_LANDMARKS = 12
 _MIN_KEYFRAMES = 4
@@ -38,6 +42,7 @@ _ALWAYS_TRIED = 12
 it costs as much as bundle adjustment of all keyframes, and similar keyframes add no evidence."""
 _MORE_KEYFRAMES, _MORE_TURNED = 1.25, 4.0
 _ITERATIONS = 20
+_ASKED = 4  # keyframes between two questions whether the object is a surface of revolution (chosen)
 _LANDMARK_PRIOR = (
     0.05  # cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
 )
@@ -59,6 +64,28 @@ def insert_frame(
     last = object_map.keyframes[-1].pose, view.index
     state = state.with_map(object_map, last_pose=last, tracked_points=followed)
     return refine_by_landmarks(fix_depth_reversal(state, config), config)
+
+
+def adopt_free_axis(state: SolverState, config: OnlineConfig) -> SolverState:
+    """The state before the next frame, with a surface of revolution if its keyframes tell that it is one.
+
+    It is asked at every fourth keyframe, and takes seconds.
+    """
+    object_map, last = state.object_map, state.object_map.keyframes[-1]
+    due = last.index == state.last_pose[1] and len(object_map.keyframes) % _ASKED == 0
+    asked = object_map.pointless and object_map.free_axis is None and not object_map.fixed_keyframes
+    if state.inactive_maps or not (due and asked):
+        return state
+    with in_stage("map"):
+        weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
+        object_map = as_surface_of_revolution(object_map, weights, others)
+    if object_map.free_axis is None:
+        return state
+    last = object_map.keyframes[-1]
+    known = last.pose, last.index
+    return state.with_map(
+        object_map, last_pose=known, previous_pose=None, trajectory=(known,), baseline=LossBaseline()
+    )
 
 
 def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:

@@ -110,6 +110,7 @@ def make_estimate(
         hypothesis=found.hypothesis,
         iterations=fit.iterations,
         losses={"appearance": fit.appearance, "outline": fit.outline, "points": fit.points},
+        free_axis=found.evidence.free_axis,
         diagnostics={
             "inliers": float(found.evidence.inliers),
             "outlier_ratio": found.evidence.outlier_ratio,

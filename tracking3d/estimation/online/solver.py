@@ -21,7 +21,7 @@ from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online import atlas, refiner
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initializer import Initializer
-from tracking3d.estimation.online.mapper import insert_frame
+from tracking3d.estimation.online.mapper import adopt_free_axis, insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, view_frame
 from tracking3d.estimation.online.masks import (
@@ -117,6 +117,8 @@ class OnlineSolver:
         if state.phase is SolverPhase.INITIALIZING:
             return self.initializer.add(state, frame, image, binary)
         state, revised = self.initializer.restart_if_misfit(state)
+        if not self.initializer.in_background:  # it takes seconds, for which a live source would wait
+            state = adopt_free_axis(state, self.options)
         state, estimate = self._track(state, frame, image, binary, self.options)
         if binary is not None and atlas.needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, image, binary)
@@ -252,6 +254,8 @@ class OnlineSolver:
             followed = own.points.concatenate(followed)
         if state.previous_pose is not None:
             starts |= pose_predictions(state, frame.index, binary)
+        elif object_map.free_axis is not None and state.last_pose[1] == frame.index - 1:
+            starts["last"] = state.last_pose[0]  # the causal pose may be of a surface that was another one
         view = view_frame(self.observer, state, frame, binary, causal, followed)
         found = self.tracker.find(state, view, frame, image, starts)
         before = state.last_pose if state.last_pose[1] == frame.index - 1 else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,8 @@ class Tracker:
             state, fit.pose, frame.index
         )
         assessment = assess_pose(fit, state.baseline, support, won == ROTATION_SEARCH, astray)
+        if object_map.free_axis is not None:
+            fit = replace(fit, pose=object_map.free_axis.untwisted(fit.pose, state.last_pose[0]))
         best = PoseCandidate(view, fit, won, kept, support, assessment)
         if best.lost or (best.doubtful and should_retry(state.doubtful_frames)):
             other = self._elsewhere(state, frame, image, view.mask)

@@ -47,6 +47,8 @@ class Answers:
         points: Follows points.
         corrected_points: Follows points with the help of the images too.
         tracked: Frames that the method called tracked, if it says so.
+        free_axes: ``(3,)`` unit vectors in estimated object coordinates, by frame index: the method says that rotation
+            about them is not known.
         visible_masks: Without what is in front of the object, by frame index; None if the method cannot tell.
     """
 
@@ -70,6 +72,7 @@ class Answers:
     corrected_points: PointTracker | None = None
     tracked: frozenset[int] | None = None
     visible_masks: Mapping[int, MaskReference] | None = None
+    free_axes: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def matched(self, frames: int) -> str:
         """Which frames are scored, in words.

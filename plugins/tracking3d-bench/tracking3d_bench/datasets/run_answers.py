@@ -79,6 +79,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
         if has_mesh and has_landmarks(run)
         else None,
         tracked=frozenset(index for index, one in records.items() if one.status is Status.TRACKED),
+        free_axes={index: np.array(one.free_axis) for index, one in records.items() if one.free_axis},
     )
 
 

@@ -57,6 +57,20 @@ def consecutive_axis_errors(R_est: Rotations, R_true: Rotations, axis: ArrayLike
     return np.array([_angles(one, other[None])[0] for one, other in pairwise(seen)])
 
 
+def tilts(R_est: Rotations, axes: NDArray[np.float64], R_true: Rotations, axis: ArrayLike) -> Angles:
+    """Angle ``(N,)`` between estimated axes ``(N, 3)``, whose ends are not told apart, and the true one.
+
+    Args:
+        R_est, R_true: ``(N, 3, 3)``.
+        axes: In estimated object coordinates.
+        axis: ``(3,)`` in true object coordinates.
+    """
+    seen = np.einsum("nij,nj->ni", R_est, axes)
+    true = R_true @ finite("axis", axis, 3)
+    across = np.linalg.norm(np.cross(seen, true), axis=1)
+    return np.degrees(np.arctan2(across, np.abs(np.einsum("ni,ni->n", seen, true))))
+
+
 def _axes_as_estimated(R_est: Rotations, R_true: Rotations, axis: ArrayLike) -> NDArray[np.float64]:
     """``(N, 3)`` unit vectors: the true axis in estimated object coordinates, by every frame."""
     if R_est.shape != R_true.shape or R_est.ndim != 3 or not len(R_est):

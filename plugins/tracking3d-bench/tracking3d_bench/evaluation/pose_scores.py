@@ -47,6 +47,9 @@ class PoseScores:
         rotation_error_consecutive_median_deg: From each to the next, if both have an estimate.
         rotation_error_return_deg: Error of the turn from the first to the last of the frames, in a clip that ends with
             the view that it began with and was 45 degrees away from it in between; None in others.
+        axis_tilt_mean_deg, axis_tilt_max_deg: Angle between the axis of symmetry and the axis about which the method
+            says that rotation is not known, over the frames that name one; None without either.
+        share_axis_named: Share of the frames that name one, right or wrong.
         share_under_5_deg: Share with an aligned error under 5 degrees; a lost frame counts as not.
         rotation_auc_20_deg: The same share for a limit from 0 to 20 degrees, averaged over the limit.
         translation_error_mean_percent, translation_error_median_percent: Aligned by one similarity, in percent of
@@ -68,6 +71,9 @@ class PoseScores:
     translation_error_median_percent: float | None = None
     translation_share_under_5_percent: float | None = None
     frames_with_pose: int = 0
+    axis_tilt_mean_deg: float | None = None
+    axis_tilt_max_deg: float | None = None
+    share_axis_named: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +202,21 @@ def score_poses(answers: Answers, pairs: PosePairs | None, alignment: ObjectAlig
         return PoseScores()
     turned = _score_rotations(answers, pairs.with_rotation)
     moved = _score_translations(answers, pairs.with_position, alignment)
-    return PoseScores(**turned, **moved, frames_with_pose=len(pairs.frames))
+    named = _score_axis(answers, pairs.with_rotation)
+    return PoseScores(**turned, **moved, **named, frames_with_pose=len(pairs.frames))
+
+
+def _score_axis(answers: Answers, pairs: PosePairs) -> dict[str, float | None]:
+    if not pairs.frames:
+        return {}
+    indices = [pairs.frames[place] for place in pairs.found]
+    named = [place for place, index in enumerate(indices) if index in answers.free_axes]
+    share = {"share_axis_named": len(named) / len(pairs.frames)}
+    if pairs.axis is None or not named:
+        return {**share}
+    axes = np.array([answers.free_axes[indices[place]] for place in named])
+    tilts = axis_symmetry.tilts(pairs.T_est[named, :3, :3], axes, pairs.T_true[named, :3, :3], pairs.axis)
+    return {**share, "axis_tilt_mean_deg": float(tilts.mean()), "axis_tilt_max_deg": float(tilts.max())}
 
 
 def _score_rotations(answers: Answers, pairs: PosePairs) -> dict[str, float | None]:

@@ -200,10 +200,10 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     reverse = reverse_rotations(chosen, camera)
     poses = [present, reverse]
     poses += [one for other in (present, reverse) for one in vary_rotations(chosen, other, camera)]
-    blank = replace(object_map, vertices=object_map.shape.rest)
+    blank = replace(object_map, vertices=object_map.shape.rest, free_axis=None)
     tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
     (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
-    as_it_is = replace(object_map, keyframes=_with_poses(chosen, present))
+    as_it_is = replace(object_map, keyframes=_with_poses(chosen, present), free_axis=None)
     ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
     clear = cost < _CLEARLY_BETTER * min([before, *others])

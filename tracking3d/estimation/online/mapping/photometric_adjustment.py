@@ -2,7 +2,8 @@
 
 Levenberg-Marquardt on the photometric differences of shared faces (`face_equations`), on the outlines' signed
 distances, and on the Laplacian of the shape's offsets. The shape moves in the lowest modes of its Laplacian, so that
-all unknowns form one small dense system. The first pose is fixed.
+all unknowns form one small dense system. The first pose is fixed. If the map has a free axis, its surface stays one of
+revolution: the shape moves by its profile, and the axis is fixed in place of the first pose.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ class _Problem:
     layers: Tensor  # see `layers_of`
     distance: Tensor  # (B, S, S) to the masks' outlines, pixels of the window
     mask_weight: Tensor  # (B,) how far each mask is trusted
+    # (3 M, N) the shape unknowns for each change of the profile of a surface of revolution; None: all are free
+    tied: Tensor | None = None
 
     @property
     def size(self) -> int:
@@ -109,9 +112,13 @@ def fit_jointly(
         weights: The weights of outline and smoothness.
         iterations: The most evaluations after the first.
     """
-    problem = _problem(object_map, modes, weights)
+    axis, tied = object_map.free_axis, None
+    if axis is not None:
+        modes, tied = axis.basis(object_map.vertices)
+    problem = replace(_problem(object_map, modes, weights), tied=tied)
     free = torch.ones(problem.unknowns, dtype=torch.bool)
-    free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
+    if axis is None:
+        free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
     state = _minimize(problem, free, iterations)
     keyframes = tuple(
         replace(view, pose=state.poses[n], texture=None) for n, view in enumerate(object_map.keyframes)
@@ -185,19 +192,24 @@ def _step(
     # The light is fitted again at every state: its part of the step is only what the others must allow for.
     free = free.clone()
     free[problem.shape_unknowns + 6 * len(problem.K) :] = True
-    matrix = equations.matrix[free][:, free]
+    matrix, gradient = equations.matrix, equations.gradient
+    if problem.tied is not None:
+        tied = torch.block_diag(problem.tied, torch.eye(len(free) - len(problem.tied)).to(problem.tied))
+        matrix, gradient, free = tied.T @ matrix @ tied, tied.T @ gradient, (free[:, None] * tied != 0).any(0)
+    matrix = matrix[free][:, free]
     diagonal = matrix.diagonal()
     damped = matrix + torch.diag(damping * diagonal + 1e-7 * diagonal.max())
-    solution, failed = torch.linalg.solve_ex(damped, -equations.gradient[free])
+    solution, failed = torch.linalg.solve_ex(damped, -gradient[free])
     if failed or not solution.isfinite().all():
         return None
-    step = torch.zeros_like(equations.gradient)
+    step = torch.zeros_like(gradient)
     step[free] = solution
+    step = step if problem.tied is None else tied @ step
     shape, poses, _ = step.split(
         [problem.shape_unknowns, 6 * len(problem.K), len(step) - problem.shape_unknowns - 6 * len(problem.K)]
     )
     vertices = state.vertices + (problem.modes.vectors @ shape.reshape(-1, 3)).to(state.vertices)
-    vertices = unfold(problem.object_map.shape, vertices)
+    vertices = vertices if problem.tied is not None else unfold(problem.object_map.shape, vertices)
     # Steps (v, w) in the camera's axes, about the poses' own translations.
     moving, turning = poses.reshape(-1, 6).to(vertices).split(3, dim=1)
     moved = from_matrix(rotation_exponential(turning) @ state.poses.R, state.poses.translation + moving)

@@ -16,6 +16,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
+from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.shape import Shape, visible_texture
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -76,6 +77,8 @@ class ObjectMap:
     # index of the newest keyframe when dense landmarks were last asked to refine the map; -1 if they never
     # were
     asked_landmarks: int = -1
+    # of an object without points that is a surface of revolution; its surface is kept one. None if it has none
+    free_axis: FreeAxis | None = None
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:

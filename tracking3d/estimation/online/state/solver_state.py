@@ -14,6 +14,7 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
+from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
@@ -174,5 +175,6 @@ ONLINE_CLASSES = (
     Keypoints,
     LossBaseline,
     FrameCrop,
+    FreeAxis,
 )
 """The classes that a `SolverState` consists of, besides `tracking3d.estimation.solver.STATE_CLASSES`."""
