@@ -17,7 +17,7 @@ from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.rendering.interpolation import interpolate
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import sample_texture
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.results.description import RunHeader
 from tracking3d.results.run_writer import RunWriter

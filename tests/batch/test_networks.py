@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tracking3d.batch.networks import keep_networks, share_networks
-from tracking3d.batch.video_job import VideoJob
+from tracking3d.batch.video_job import VideoJob, keep_networks, share_networks
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.choosing import InThisProcess
 from tracking3d.networks.catalogue import known_networks

@@ -18,7 +18,7 @@ from tracking3d.batch.summary import COLUMNS, MARKER
 from tracking3d.config.loading import load_config
 from tracking3d.engines.choosing import InThisProcess
 from tracking3d.errors import InputError, OutputError
-from tracking3d.results.lock import try_lock
+from tracking3d.results.files import try_lock
 from tracking3d.results.run_reader import RunReader
 
 

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.calibration.calibrated_camera import CalibratedCamera
-from tracking3d.calibration.camera_files import read_camera, write_camera
+from tracking3d.calibration.camera_files import CalibratedCamera, read_camera, write_camera
 from tracking3d.errors import InputError
 
 COLMAP = """# Camera list with one line of data per camera:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from tracking3d.errors import InputError
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import write_probability
 from tracking3d.results.run_reader import RunReader
 from tracking3d.trackers.region_files import read_regions
 from tracking3d.trackers.vot_regions import rasterise

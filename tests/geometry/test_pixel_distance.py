@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from tracking3d.geometry.pixel_distance import pixel_distance
+from tracking3d.geometry.camera import pixel_distance
 
 
 def ellipse(size: tuple[int, int], degrees: int) -> np.ndarray:

@@ -18,8 +18,7 @@ from tracking3d.frames import MaskEstimate
 from tracking3d.picker import session as session_module
 from tracking3d.picker.correction import command_of, save_outcome, settings_as_yaml
 from tracking3d.picker.server import Picker
-from tracking3d.picker.session import PickingSession
-from tracking3d.picker.settings import ChosenSettings, SettingsMenu
+from tracking3d.picker.session import ChosenSettings, PickingSession, SettingsMenu
 from tracking3d.video import open_source
 from tracking3d.video.any_frame import frame_images
 from tracking3d.web.access import Access

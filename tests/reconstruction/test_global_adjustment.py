@@ -15,7 +15,7 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, LENS_KNOWN, Camera
 from tracking3d.points import landmark_adjustment
-from tracking3d.points.track_chaining import Chain
+from tracking3d.points.warping import Chain
 from tracking3d.reconstruction import global_adjustment
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.results.records import FrameRecord

@@ -13,7 +13,7 @@ from test_volume import shape_views
 from tracking3d.points.outline_fit import fit_to_outlines
 from tracking3d.reconstruction.held_out_test import HeldOutScore, is_held_out, score_held_out
 from tracking3d.reconstruction.photometric_poses import coloured_surface, refine_views
-from tracking3d.reconstruction.seen_vertices import seen_vertices
+from tracking3d.reconstruction.seen_regions import seen_vertices
 from tracking3d.reconstruction.shape import reconstruct_shape
 
 

@@ -10,7 +10,7 @@ import trimesh
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
-from tracking3d.reconstruction.unseen_closing import close_unseen, pull_into
+from tracking3d.reconstruction.seen_regions import close_unseen, pull_into
 
 SIDE = 64
 

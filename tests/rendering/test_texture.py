@@ -11,7 +11,7 @@ from render_oracle import bilinear
 from torch.autograd import gradcheck
 
 from tracking3d.rendering import sample_texture
-from tracking3d.rendering.texture import bilinear_taps
+from tracking3d.rendering.surface import bilinear_taps
 
 
 @pytest.fixture

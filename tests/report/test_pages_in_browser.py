@@ -18,7 +18,7 @@ from tracking3d.report import run_report
 from tracking3d.report.comparison import write_comparison
 from tracking3d.report.differences import compare_runs
 from tracking3d.report.run_report import write_report
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import write_probability
 from tracking3d.results.run_reader import RunReader
 
 PHONE = {"width": 390, "height": 844}

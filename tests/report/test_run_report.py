@@ -22,8 +22,8 @@ from tracking3d.report.doubts import doubts_of
 from tracking3d.report.run_report import probability_layers, write_report
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
+from tracking3d.results.files import write_probability
 from tracking3d.results.layout import runs_in
-from tracking3d.results.probabilities import write_probability
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 

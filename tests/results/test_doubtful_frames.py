@@ -6,7 +6,7 @@ import pytest
 from recorded_runs import estimate_of
 
 from tracking3d.estimation.estimate import Status
-from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
+from tracking3d.results.notes import DoubtfulRange, doubtful_ranges
 from tracking3d.results.records import FrameRecord
 
 

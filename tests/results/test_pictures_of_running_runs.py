@@ -11,7 +11,7 @@ from PIL import Image
 from recorded_runs import estimate_of, frame_of, model, open_run
 
 from tracking3d.results import layout, run_writer
-from tracking3d.runtime.regular_work import RegularWork
+from tracking3d.runtime.concurrency import RegularWork
 from tracking3d.video import open_source
 
 

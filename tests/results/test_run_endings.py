@@ -13,7 +13,7 @@ import pytest
 
 from tracking3d.errors import OutputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.results import layout, lock
+from tracking3d.results import files, layout
 from tracking3d.results.description import is_gone, this_process
 from tracking3d.results.files import write_reserved
 from tracking3d.results.run_reader import RunReader
@@ -90,7 +90,7 @@ def test_a_run_whose_process_is_gone_is_seen(tmp_path, turning_sphere, start_run
         def none(*_):
             raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-        monkeypatch.setattr(lock, "_lock", none)
+        monkeypatch.setattr(files, "_lock", none)
     assert RunReader(tmp_path).state_in_words == "running"
     assert "is running; frames estimated so far: 1" in RunReader(tmp_path).not_finished
     writer._lines.close()

@@ -9,9 +9,8 @@ import pytest
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_mask
+from tracking3d.results.files import read_mask, read_occluder, write_mask, write_visible_masks
 from tracking3d.results.run_writer import is_initial_mask, write_initial_mask
-from tracking3d.results.visible_masks import read_occluder, write_visible_masks
 
 MASK = np.zeros((20, 30), bool)
 MASK[5:15, 5:20] = True

@@ -22,9 +22,8 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.components import build_encoder
 from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_mask
+from tracking3d.results.files import read_mask, write_mask, write_visible_masks
 from tracking3d.results.run_writer import write_initial_mask
-from tracking3d.results.visible_masks import write_visible_masks
 from tracking3d.submaps import merge_step, merged_run
 from tracking3d.submaps.alignment import (
     DisagreementError,

@@ -21,8 +21,7 @@ from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
 from tracking3d.submaps.job import LongVideo
 from tracking3d.submaps.merge_step import MergedSubmaps
-from tracking3d.submaps.plan import Plan
-from tracking3d.submaps.plan_step import Begun
+from tracking3d.submaps.plan import Begun, Plan
 from tracking3d.submaps.split_run import Step, steps_to_the_end
 from tracking3d.submaps.submap_runs import Revisit
 from tracking3d.synthesis.convex_clips import SyntheticSpec, degrade_masks, synthesize

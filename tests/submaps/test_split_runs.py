@@ -17,7 +17,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.submaps import merge_step, plan_step, split_run
+from tracking3d.submaps import merge_step, plan, split_run
 from tracking3d.submaps.alignment import DisagreementError
 from tracking3d.submaps.job import SplitResult
 from tracking3d.submaps.plan import PARTS
@@ -74,9 +74,7 @@ def test_what_cannot_be_joined_is_not_split(override, short, tmp_path):
 
 def test_a_video_shorter_than_a_part_is_one_run(short, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        plan_step, "record_tracking", lambda request, folder, options, tell: asked.append(options)
-    )
+    monkeypatch.setattr(plan, "record_tracking", lambda request, folder, options, tell: asked.append(options))
     ended = record_in_parts(
         short, settings(short), tmp_path / "run", PromptSet(), length="1000f", selection="0:40"
     )
@@ -92,7 +90,7 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     def track(tell, job):
         done.append((job.folder.name, job.first_pass_only, job.selection))
         if not job.first_pass_only:
-            monkeypatch.setattr(plan_step, "is_finished", lambda folder: True)
+            monkeypatch.setattr(plan, "is_finished", lambda folder: True)
 
     def refuse(*given):
         raise DisagreementError("parts 1 and 2: they tell of two objects")
@@ -142,7 +140,7 @@ def test_a_folder_of_somebody_s_parts_is_left_alone(short, tmp_path, monkeypatch
     own = tmp_path / "run" / PARTS / "mine.txt"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    monkeypatch.setattr(plan_step, "record_tracking", lambda *given: None)
+    monkeypatch.setattr(plan, "record_tracking", lambda *given: None)
     record_in_parts(short, settings(short), tmp_path / "run", PromptSet(), length="1000f", overwrite=True)
     assert own.read_text() == "mine"
 

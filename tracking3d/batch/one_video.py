@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.batch.datasets import dataset_reader
-from tracking3d.batch.networks import SharedNetwork, keep_networks
 from tracking3d.batch.storage import absolute, copy_to_local, join_path, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
-from tracking3d.batch.video_job import VideoJob
+from tracking3d.batch.video_job import SharedNetwork, VideoJob, keep_networks
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError

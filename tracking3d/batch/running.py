@@ -11,20 +11,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tracking3d.batch.folder import BatchProgress, Failure, write_progress, write_tables
-from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.storage import base, join_path, local, read_many, write
 from tracking3d.batch.summary import MARKER, read_marker
 from tracking3d.batch.tasks import Tasks, is_finished_video
-from tracking3d.batch.video_job import VideoJob
+from tracking3d.batch.video_job import VideoJob, share_networks
 from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
 from tracking3d.errors import OutputError
 from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
-from tracking3d.results.files import writing
+from tracking3d.results.files import try_lock, writing
 from tracking3d.results.layout import refuse_root
-from tracking3d.results.lock import try_lock
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from tracking3d.batch.networks import SharedNetwork
 from tracking3d.batch.one_video import (
     RUN,
     count_attempt,
@@ -20,13 +19,13 @@ from tracking3d.batch.one_video import (
     put_away,
     track_video,
 )
-from tracking3d.batch.video_job import VideoJob
+from tracking3d.batch.video_job import SharedNetwork, VideoJob
 from tracking3d.engines.protocol import Ended, Task, Tell
 from tracking3d.prompts.boxes import parse_box
 from tracking3d.prompts.points import parse_points
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.submaps.job import LongVideo, SplitResult
-from tracking3d.submaps.plan_step import Begun, begin
+from tracking3d.submaps.plan import Begun, begin
 from tracking3d.submaps.split_run import Step, Steps, steps_of
 
 

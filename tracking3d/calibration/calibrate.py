@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.calibration.calibrated_camera import CalibratedCamera
+from tracking3d.calibration.camera_files import CalibratedCamera
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.lens import COUNTS, Model

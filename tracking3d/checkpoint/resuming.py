@@ -16,7 +16,7 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
-from tracking3d.results.lock import is_locked
+from tracking3d.results.files import is_locked
 from tracking3d.results.records import jsonable
 from tracking3d.results.run_reader import RunReader
 

@@ -14,16 +14,22 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from tracking3d.checkpoint.folder import Milestone, milestones_in
+from tracking3d.checkpoint.folder import Checkpoint, Milestone, milestones_in
 from tracking3d.checkpoint.integrity import RunIntegrity
-from tracking3d.checkpoint.progress import RunProgress, read_journal
+from tracking3d.checkpoint.progress import RunProgress, SavedState, read_journal
 from tracking3d.checkpoint.resuming import Earlier, changed_frames, earlier_run
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
-from tracking3d.results.files import link_or_copy, write_atomic, writing
-from tracking3d.results.lock import is_locked, try_lock
+from tracking3d.results.files import is_locked, link_or_copy, try_lock, write_atomic, writing
 from tracking3d.results.records import jsonable, latest
-from tracking3d.results.run_reader import RunReader, is_finished, read_records, replacement_has_begun
+from tracking3d.results.refinement_writer import clear_refinement, undo_taking_over
+from tracking3d.results.run_reader import (
+    FormatError,
+    RunReader,
+    is_finished,
+    read_records,
+    replacement_has_begun,
+)
 from tracking3d.results.run_unit import complete_scaling
 
 _log = logging.getLogger(__name__)
@@ -252,3 +258,55 @@ def prompt_record_in(run: RunReader) -> dict[str, Any]:
     if not isinstance(prompt, dict):
         raise InputError(f"The run {run.folder} names no prompt; run the video again, with the correction.")
     return prompt
+
+
+def read_intact_state(folder: Path, checkpoint: Checkpoint) -> SavedState | None:
+    """Read the last saved state of a stopped run whose frames are all whole; an earlier one takes its place.
+
+    If it is not the very last state, one sentence says what is damaged, and where the run goes on.
+
+    Args:
+        folder: The run folder.
+        checkpoint: Its checkpoint.
+
+    Returns:
+        The state; None if frames are damaged and no state from before them was saved: the run begins again.
+
+    Raises:
+        InputError: If the last state itself is damaged and there is no other.
+        FormatError: If it was written by another version.
+        OutputError: If an earlier state cannot take its place.
+    """
+    integrity, why, unreadable = RunIntegrity(folder), "", None
+    for name in (layout.STATE_FILE, *checkpoint.earlier_states()):
+        try:
+            kept = checkpoint.read(name)
+        except FormatError:
+            raise
+        except InputError as error:
+            unreadable, why = unreadable or error, why or f"{layout.STATE}/{name} is damaged"
+            continue
+        damage = integrity.of_state(kept.progress, kept.taken)
+        if not damage:
+            if why:
+                _return_to(folder, checkpoint, name, kept, why)
+            return kept
+        why = why or damage
+    if unreadable is not None:
+        raise unreadable
+    _log.warning("%s: %s, and no state from before that is saved; the run begins again.", folder, why)
+    return None
+
+
+def _return_to(folder: Path, checkpoint: Checkpoint, name: str, kept: SavedState, why: str) -> None:
+    if kept.progress.refining:
+        _log.warning("%s: %s; the final refinement begins again.", folder, why)
+    else:
+        with writing(folder):
+            undo_taking_over(folder)
+        clear_refinement(folder)
+        last = kept.progress.last
+        _log.warning(
+            "%s: %s; the run goes on after frame %d, the last one whose state is saved.", folder, why, last
+        )
+    checkpoint.return_to(name)

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from tracking3d.cli.tracking import RunDisplay, RunRequest
     from tracking3d.config.models import PipelineConfig
     from tracking3d.picker.server import Picker
-    from tracking3d.picker.session import Picked
-    from tracking3d.picker.settings import ChosenSettings, SettingsMenu
+    from tracking3d.picker.session import ChosenSettings, Picked, SettingsMenu
     from tracking3d.prompts.prompt import PromptSet
 
 
@@ -145,7 +144,7 @@ def settings_menu(
         settings: The same; quality and final mesh.
         configure: Makes the configuration from such options.
     """
-    from tracking3d.picker.settings import ChosenSettings, SettingsMenu
+    from tracking3d.picker.session import ChosenSettings, SettingsMenu
 
     lens = camera.settings()
     at_first = ChosenSettings(

@@ -17,8 +17,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Box, Frame
-from tracking3d.geometry.camera import Camera, Window
-from tracking3d.geometry.pixel_distance import pixel_distance
+from tracking3d.geometry.camera import Camera, Window, pixel_distance
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import PoseTarget, channels_last, signed_distance
 

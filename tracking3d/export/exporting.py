@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tracking3d.config.camera import check_object_size
 from tracking3d.config.explain import nearest
-from tracking3d.config.object_size import check_object_size
 from tracking3d.errors import InputError, OutputError, argument
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS

@@ -14,7 +14,7 @@ from tracking3d.estimation.paper.problem import iou_loss, laplacian_loss
 from tracking3d.geometry.mesh import uniform_laplacian
 from tracking3d.modules.renderer import RenderedViews
 from tracking3d.rendering import contour_loss, find_contour, signed_distance, texture_losses
-from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.surface import check_shapes
 
 Reduction = Literal["mean", "none"]
 

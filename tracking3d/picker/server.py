@@ -26,8 +26,14 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
-from tracking3d.picker.session import Picked, PickingSession
-from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words, tracker_lines
+from tracking3d.picker.session import (
+    Picked,
+    PickingSession,
+    parse_settings,
+    setting_choices,
+    settings_in_words,
+    tracker_lines,
+)
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
 from tracking3d.web.access import SAFE_HEADERS, Access

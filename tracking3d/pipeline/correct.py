@@ -19,7 +19,7 @@ from tracking3d.prompts.corrections import Correction, missing_frame_error, vali
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.reconstruction.rebuild import check_packages
 from tracking3d.results import layout
-from tracking3d.results.given_masks import read_given_mask
+from tracking3d.results.files import read_given_mask
 from tracking3d.results.layout import runs_in
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, open_run_source

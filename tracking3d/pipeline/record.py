@@ -16,9 +16,8 @@ from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.integrity import RunIntegrity
 from tracking3d.checkpoint.progress import SavedState
 from tracking3d.checkpoint.resuming import Earlier, earlier_run, prompt_record
-from tracking3d.checkpoint.return_point import read_intact_state
 from tracking3d.checkpoint.run_state import RunState
-from tracking3d.checkpoint.staging import keeps_shape, stage_correction, take_over
+from tracking3d.checkpoint.staging import keeps_shape, read_intact_state, stage_correction, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
@@ -34,7 +33,7 @@ from tracking3d.prompts.prompt import PromptSet
 from tracking3d.reconstruction.final_shape import is_reconstructed, make_final_shape
 from tracking3d.results import layout
 from tracking3d.results.description import RunHeader
-from tracking3d.results.given_masks import keep_given_masks
+from tracking3d.results.files import keep_given_masks
 from tracking3d.results.layout import object_folders
 from tracking3d.results.mesh_export import export_mesh, load_model, restore_texture
 from tracking3d.results.overwrite import check_output_folder

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.camera import choose_camera
+from tracking3d.config.camera import choose_camera, set_object_size
 from tracking3d.config.explain import format_value
 from tracking3d.config.loading import ModelChoice, check_model, set_model
 from tracking3d.config.models import PipelineConfig
-from tracking3d.config.object_size import set_object_size
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Box

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.robust_bundle import intersect
-from tracking3d.points.track_chaining import Chain, follow_chain
+from tracking3d.points.warping import Chain, follow_chain
 from tracking3d.scene.surface import Drawn, sample
 from tracking3d.scene.view import Array
 

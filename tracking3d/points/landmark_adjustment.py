@@ -23,9 +23,8 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.robust_bundle import bundle, other_way_round
-from tracking3d.points.track_chaining import follow_chain
 from tracking3d.points.view import redraw_surface
-from tracking3d.points.warping import Warps
+from tracking3d.points.warping import Warps, follow_chain
 from tracking3d.runtime.progress import report_progress
 from tracking3d.scene.surface import Drawn
 from tracking3d.scene.view import Array

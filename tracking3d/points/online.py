@@ -19,9 +19,9 @@ from tracking3d.points.answers import PointAnswers
 from tracking3d.points.follow import RIM, combine_with_images
 from tracking3d.points.landmark_adjustment import TOLERANCE
 from tracking3d.points.robust_bundle import bundle
-from tracking3d.points.track_chaining import STEPS, Chain, extend
 from tracking3d.points.view import redraw_surface
-from tracking3d.points.warping import Warps
+from tracking3d.points.warping import CHAIN_STEPS as STEPS
+from tracking3d.points.warping import Chain, Warps, extend
 from tracking3d.scene.surface import Drawn, sample
 from tracking3d.scene.view import Array
 

@@ -28,7 +28,7 @@ from tracking3d.reconstruction.run_views import (
     collect_views,
     no_reliable_frame_error,
 )
-from tracking3d.reconstruction.unseen_closing import close_unseen
+from tracking3d.reconstruction.seen_regions import close_unseen
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_notes import note_in_run

@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from tracking3d.reconstruction.meshing import FloatArray, Grid, decimate_roughly, extract_surface, main_pieces
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane, find_symmetry_planes
 from tracking3d.reconstruction.plane_sweep import Guide
-from tracking3d.reconstruction.seen_vertices import seen_vertices
+from tracking3d.reconstruction.seen_regions import seen_vertices
 from tracking3d.scene.view import ObjectView
 
 _FACES, _SAMPLES = 4000, 4000

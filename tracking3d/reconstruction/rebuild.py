@@ -19,9 +19,9 @@ from tracking3d.reconstruction.run_views import (
     reliable_frames,
     views_of_frame,
 )
+from tracking3d.reconstruction.seen_regions import close_unseen
 from tracking3d.reconstruction.shape import MOST, reconstruct_shape
 from tracking3d.reconstruction.texturing import bake_texture, replace_shape
-from tracking3d.reconstruction.unseen_closing import close_unseen
 from tracking3d.reconstruction.views import keep_best_views, spread_by_rotation, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model

@@ -8,11 +8,22 @@ is next to them on the object, not what happens to lie beside it in the atlas.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
+from scipy.spatial import ConvexHull, QhullError
+
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
+from tracking3d.reconstruction.plane_sweep import Guide
+from tracking3d.results.mesh_export import find_seen_faces
+from tracking3d.scene.view import ObjectView
 
 FloatArray = NDArray[np.float32]
 _ROUNDS = 6  # of averaging over adjacent faces
@@ -158,3 +169,80 @@ def _adjacent_faces(faces: NDArray[np.int64]) -> csr_array:
     a, b = owner[order][:-1][same], owner[order][1:][same]
     ones = np.ones(2 * len(a))
     return coo_array((ones, (np.r_[a, b], np.r_[b, a])), shape=(len(faces),) * 2).tocsr()
+
+
+def seen_vertices(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ObjectView]
+) -> NDArray[np.bool_]:
+    """``(V,)`` whether any of the views shows a vertex.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        views: The frames.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    tolerance = 0.01 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    seen = np.zeros(len(vertices), np.bool_)
+    for view in views:
+        drawn, _ = Guide(vertices, faces).visible_to(view)
+        x, y, z = view.P[:, :3] @ vertices.T + view.P[:, 3:]
+        column, row = np.rint(x / z).astype(int), np.rint(y / z).astype(int)
+        inside = (z > 0) & (column >= 0) & (column < len(drawn)) & (row >= 0) & (row < len(drawn))
+        eye = -view.T_cam_obj[:3, :3].T @ view.T_cam_obj[:3, 3]
+        front = (mesh.vertex_normals * (eye - vertices)).sum(1) > 0
+        at = row.clip(0, len(drawn) - 1), column.clip(0, len(drawn) - 1)
+        seen |= inside & front & (z < drawn[at] + tolerance)
+    return seen
+
+
+# How a surface is closed where no frame has shown it: no further than the convex hull of what was seen.
+#
+# The surface of the online map begins as an ellipsoid, and what no frame shows keeps bulging. The convex hull is the
+# smallest convex body that has everything in it that was seen: of a box whose three faces at one corner were seen it is
+# five sixths of the box.
+
+_LEAST = 12  # seen vertices that a hull is made of
+
+
+def close_unseen(model: ObjectModel, planes: Sequence[SymmetryPlane] = ()) -> ObjectModel:
+    """The model with the vertices that no frame has shown moved into the convex hull of the others.
+
+    They move towards the middle of the hull, until they are on it. Vertices that were seen stay, other than those of
+    specks (`select_large_regions`), and so does the whole model if what was seen lies in one plane.
+
+    Args:
+        model: The model with the texture that says what was seen.
+        planes: Planes of symmetry: the mirror images of what was seen are in the hull, too.
+    """
+    seen = np.zeros(len(model.vertices), bool)
+    seen[model.faces[select_large_regions(model.vertices, model.faces, find_seen_faces(model))]] = True
+    if seen.all() or np.count_nonzero(seen) < _LEAST:
+        return model
+    held = model.vertices[seen]
+    for plane in planes:
+        held = np.concatenate([held, plane.reflect(held)])
+    try:
+        hull = ConvexHull(held)
+    except QhullError:
+        return model
+    middle = hull.points[hull.vertices].mean(0)
+    vertices = model.vertices.copy()
+    vertices[~seen] = pull_into(vertices[~seen], middle, hull.equations)
+    return replace(model, vertices=vertices)
+
+
+def pull_into(
+    points: NDArray[np.float64], middle: NDArray[np.float64], planes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points outside a convex body moved onto it, along the lines to a point within.
+
+    Args:
+        points: ``(N, 3)``.
+        middle: ``(3,)`` within the body.
+        planes: ``(M, 4)``, for each of its faces the outward normal and the offset: negative inside.
+    """
+    room = -(planes[:, :3] @ middle + planes[:, 3])
+    outward = (points - middle) @ planes[:, :3].T
+    reach = np.where(outward > 0, room / np.maximum(outward, 1e-300), np.inf).min(1)
+    return np.asarray(middle + np.minimum(reach, 1.0)[:, None] * (points - middle))

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.meshing import unwrap
-from tracking3d.reconstruction.seen_regions import select_seen_texels, spread_colours
-from tracking3d.reconstruction.seen_vertices import seen_vertices
+from tracking3d.reconstruction.seen_regions import seen_vertices, select_seen_texels, spread_colours
 from tracking3d.rendering import TexelMap, render, seen_texels
 from tracking3d.rendering.backend import give_threads, threads_kept
 from tracking3d.rendering.backprojection import SeenTexels

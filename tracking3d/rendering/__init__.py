@@ -21,9 +21,8 @@ from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, Pose
 from tracking3d.rendering.pose_terms import pose_terms
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
 from tracking3d.rendering.silhouette import soft_silhouette
-from tracking3d.rendering.surface import Surface
+from tracking3d.rendering.surface import Surface, sample_texture
 from tracking3d.rendering.surface_visibility import visible_texels, visible_vertices
-from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.texture_losses import channels_last, texture_losses
 from tracking3d.rendering.visibility import Visibility, rasterize
 

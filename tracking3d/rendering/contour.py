@@ -18,8 +18,7 @@ from torch.nn import functional
 from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.normal_equations import NormalEquations, screen_motion
 from tracking3d.rendering.renderer import Rendering
-from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.surface import edges_of
+from tracking3d.rendering.surface import check_shapes, edges_of
 from tracking3d.rendering.surface_visibility import front_faces
 from tracking3d.rendering.texture_losses import cauchy
 from tracking3d.rendering.visibility import expand_ranges

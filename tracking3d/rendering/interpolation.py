@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from tracking3d.rendering.backend import use_numba
-from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.surface import check_shapes
 from tracking3d.rendering.visibility import gather
 
 

@@ -16,8 +16,7 @@ from torch import Tensor
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.interpolation import barycentrics
 from tracking3d.rendering.renderer import Rendering
-from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.texture import bilinear_taps
+from tracking3d.rendering.surface import bilinear_taps, check_shapes
 from tracking3d.rendering.texture_losses import cauchy
 from tracking3d.rendering.visibility import gather
 

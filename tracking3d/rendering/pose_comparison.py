@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from tracking3d.rendering.normal_equations import NormalEquations
-from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.surface import Surface
+from tracking3d.rendering.surface import Surface, check_shapes
 
 NEAREST_POINT = 1e-3
 """Matched points at a smaller depth are seen as if they were there."""

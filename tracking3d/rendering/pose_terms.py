@@ -23,9 +23,7 @@ from tracking3d.rendering.pose_comparison import (
     check_comparison,
 )
 from tracking3d.rendering.renderer import Rendering, render
-from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.surface import Surface
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import Surface, check_shapes, sample_texture
 
 
 @torch.no_grad()

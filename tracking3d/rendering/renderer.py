@@ -16,9 +16,8 @@ from torch.nn import functional
 from tracking3d.geometry.camera import NEAR
 from tracking3d.geometry.mesh import vertex_normals
 from tracking3d.rendering.interpolation import interpolate
-from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.silhouette import BOXLEN, KNUM, SIGMA, soft_silhouette
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import check_shapes, sample_texture
 from tracking3d.rendering.visibility import rasterize
 
 

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.backend import use_numba
-from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.surface import check_shapes
 from tracking3d.rendering.visibility import expand_ranges, face_corners, gather
 
 SIGMA = 7000.0

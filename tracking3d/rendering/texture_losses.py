@@ -11,8 +11,7 @@ import math
 from torch import Tensor
 
 from tracking3d.rendering.backend import use_numba
-from tracking3d.rendering.shapes import check_shapes
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import check_shapes, sample_texture
 
 
 def texture_losses(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.backend import use_numba
-from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.surface import check_shapes
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@ One run is what the others are held against; none of them is the truth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -14,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.report.figures import angles_between, reliable_poses, stage_times, status_counts
-from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask
 from tracking3d.results.records import jsonable, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader
@@ -306,3 +307,37 @@ def _names(folders: list[Path]) -> list[str]:
 def _figure(kind: Any, values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
     return float(kind(known)) if len(known) else None
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting."""
+
+    name: str  # with its section, such as solver.local_window
+    value: str  # as text
+    # the value of preset default, if that is another one; None if it is the same or unknown
+    usual: str | None
+
+
+def settings_of(config: Mapping[str, Any]) -> list[Setting]:
+    """Every setting of a run, next to its default.
+
+    Args:
+        config: The configuration as ``run.json`` holds it.
+    """
+    usual = flat(load_config().model_dump(mode="json"))
+    return [
+        Setting(name, value, usual[name] if usual.get(name, value) != value else None)
+        for name, value in flat(config).items()
+    ]
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Names with their sections, and values as text."""
+    found: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
+    return found

@@ -13,9 +13,8 @@ from scipy.ndimage import median_filter
 
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, ObjectModel, Status
 from tracking3d.results.description import for_new_folder
-from tracking3d.results.doubtful_frames import count_reasons
 from tracking3d.results.layout import has_state
-from tracking3d.results.notes import MOSTLY, advice_on_photos, is_lens_uncertain, unseen_share
+from tracking3d.results.notes import MOSTLY, advice_on_photos, count_reasons, is_lens_uncertain, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 

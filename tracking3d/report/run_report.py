@@ -21,17 +21,16 @@ from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.report import figures
 from tracking3d.report.curves import Curve, curve, stretches
+from tracking3d.report.differences import settings_of
 from tracking3d.report.doubts import doubts_of, next_steps, outcome_of
 from tracking3d.report.frame_pictures import FramePictures, frame_pictures, jpeg_of
 from tracking3d.report.rendering import render_page
-from tracking3d.report.settings import settings_of
 from tracking3d.results import layout
 from tracking3d.results.contact_sheet import render_view, side_shown, texture_of_views
-from tracking3d.results.doubtful_frames import DoubtfulRange, doubtful_ranges
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.layout import partial_path
 from tracking3d.results.mesh_export import load_model, split_mesh
-from tracking3d.results.notes import unseen_share
+from tracking3d.results.notes import DoubtfulRange, doubtful_ranges, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each, report_progress

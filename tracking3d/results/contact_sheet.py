@@ -17,7 +17,7 @@ from torch import Tensor
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Image
 from tracking3d.rendering.interpolation import interpolate
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import sample_texture
 from tracking3d.rendering.visibility import rasterize
 from tracking3d.results import drawing
 from tracking3d.results.description import own_masks, time_per_frame

@@ -6,18 +6,22 @@ import errno
 import os
 import shutil
 import stat
+import sys
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.errors import OutputError
-from tracking3d.frames import OCCLUDER
+from tracking3d.errors import InputError, OutputError
+from tracking3d.frames import OCCLUDER, Prompt
+from tracking3d.prompts.corrections import Correction
+from tracking3d.results import layout
 from tracking3d.results.layout import OUT, partial_path
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -215,3 +219,168 @@ def first_problem(*steps: Callable[[], None]) -> Exception | None:
         except Exception as error:
             problem = problem or error
     return problem
+
+
+# What is seen of the object, ``visible_masks/``: the estimated masks without what is in front of them.
+#
+# They are written at the end of a run whose mask tracker says what is in front of the object.
+
+
+def expect_visible_masks(folder: Path) -> None:
+    """Make the folder of the visible masks, so that they are written at the end.
+
+    Args:
+        folder: The run folder.
+
+    Raises:
+        OutputError: If it cannot be made.
+    """
+    with writing(folder / layout.VISIBLE_MASKS):
+        (folder / layout.VISIBLE_MASKS).mkdir(exist_ok=True)
+
+
+def write_visible_masks(folder: Path) -> None:
+    """Write what is seen of the object in every frame of a run, if it is known.
+
+    Args:
+        folder: The run folder, with the final masks.
+
+    Raises:
+        OutputError: If something cannot be written.
+    """
+    if not (folder / layout.VISIBLE_MASKS).is_dir():
+        return
+    for path in sorted((folder / layout.MASKS).glob("*.png")):
+        mask, occluder = read_mask(path), read_occluder(folder, int(path.stem))
+        if mask is not None:
+            visible = mask if occluder is None else mask & ~occluder
+            write_mask(layout.visible_mask_path(folder, int(path.stem)), visible)
+
+
+def read_occluder(folder: Path, index: int) -> NDArray[np.bool_] | None:
+    """What is in front of the object in frame ``index``, ``(H, W)``; None if nothing is known to be."""
+    kept = read_packed_mask(layout.initial_mask_path(folder, index))
+    return None if kept is None or kept.occluder is None else unpack(kept.occluder, kept.shape)
+
+
+def write_probability(folder: Path, index: int, probability: NDArray[np.float32] | None) -> None:
+    """Write it ``(H, W)`` beside the masks of a folder; None removes that of an earlier estimate.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    path = layout.probability_path(folder, index)
+    with writing(path):
+        path.parent.mkdir(exist_ok=True)
+        if probability is None:
+            path.unlink(missing_ok=True)
+    if probability is not None:
+        write_image(path, np.rint(255 * probability).clip(0, 255).astype(np.uint8))
+
+
+def read_probability(folder: Path, index: int) -> NDArray[np.float32] | None:
+    """It again ``(H, W)``, in steps of 1/255; None if there is none."""
+    path = layout.probability_path(folder, index)
+    if not path.is_file() or not path.stat().st_size:
+        return None
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return None if image is None else image.astype(np.float32) / 255
+
+
+def take_over_probability(aside: Path, folder: Path, index: int) -> None:
+    """Replace the causal estimate's probability by the refined one's, in a run that has them.
+
+    Raises:
+        OSError: If it cannot be moved.
+    """
+    if not (folder / layout.PROBABILITIES).is_dir():
+        return
+    refined, place = layout.probability_path(aside, index), layout.probability_path(folder, index)
+    if refined.is_file():
+        refined.replace(place)
+    else:
+        place.unlink(missing_ok=True)
+
+
+def keep_given_masks(
+    folder: Path, first: int, prompt: Prompt | None, corrections: Iterable[Correction] = ()
+) -> None:
+    """Write the masks of the first frame and of corrections, if they were given as masks.
+
+    Args:
+        folder: The run folder.
+        first: Index of the frame that the prompt is of.
+        prompt: The object in it.
+        corrections: What it is in later frames.
+
+    Raises:
+        OutputError: If one cannot be written.
+    """
+    given = {one.frame: one.mask for one in corrections if isinstance(one.mask, np.ndarray)}
+    if prompt is not None and prompt.mask is not None and prompt.points is None:
+        given[first] = prompt.mask
+    if given:
+        with writing(folder):
+            (folder / layout.PROMPTS).mkdir(exist_ok=True)
+    for index, mask in given.items():
+        write_mask(layout.prompt_path(folder, index), mask)
+
+
+def read_given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
+    """The mask ``(H, W)`` that was given for a frame.
+
+    Raises:
+        InputError: If it is missing or damaged.
+    """
+    mask = read_mask(path := layout.prompt_path(folder, index))
+    if mask is None:
+        raise InputError(
+            f"The mask {path} that was given to the run is missing or damaged; give it again with "
+            "`tracking3d run` --resume, --mask and --correct."
+        )
+    return mask
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    # Locks are mandatory there, so one byte is locked far beyond what is ever read.
+    _BYTE = 2**30
+
+    def _lock(descriptor: int, shared: bool) -> None:
+        os.lseek(descriptor, _BYTE, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+else:
+    import fcntl
+
+    def _lock(descriptor: int, shared: bool) -> None:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+
+
+def try_lock(descriptor: int, shared: bool = False) -> bool:
+    """Lock an open file until it is closed; False if another open file holds it.
+
+    A file system without locks counts as free.
+    """
+    return _try_lock(descriptor, shared) is not False
+
+
+def is_locked(path: Path) -> bool | None:
+    """Whether the lock on ``path`` is held; None on a file system without locks."""
+    try:
+        with path.open("rb") as file:
+            free = _try_lock(file.fileno(), shared=True)
+    except OSError:
+        return False
+    return None if free is None else not free
+
+
+def _try_lock(descriptor: int, shared: bool) -> bool | None:
+    """Whether the lock could be taken; None on a file system without locks."""
+    try:
+        _lock(descriptor, shared)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:
+        return None
+    return True

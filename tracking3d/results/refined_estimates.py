@@ -12,11 +12,18 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.results import layout
-from tracking3d.results.files import decode_mask, link_or_copy, mask_file, read_mask, write_mask, writing
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import (
+    decode_mask,
+    link_or_copy,
+    mask_file,
+    read_mask,
+    read_occluder,
+    write_mask,
+    write_probability,
+    writing,
+)
 from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import measure
 
 

@@ -19,9 +19,8 @@ from tracking3d.estimation.estimate import Assessment, FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import write_atomic, writing
+from tracking3d.results.files import take_over_probability, write_atomic, writing
 from tracking3d.results.pictures import Pictures
-from tracking3d.results.probabilities import take_over_probability
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates, keep_masks, write_refined
 from tracking3d.runtime.stage_times import StageTimes, measure

@@ -19,12 +19,9 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import COUNTS, Lens
 from tracking3d.results import layout
 from tracking3d.results.description import is_gone
-from tracking3d.results.files import read_mask
-from tracking3d.results.lock import is_locked
+from tracking3d.results.files import is_locked, read_mask, read_occluder, read_probability
 from tracking3d.results.mesh_export import load_mesh
-from tracking3d.results.probabilities import read_probability
 from tracking3d.results.records import FrameRecord, latest, read_stages
-from tracking3d.results.visible_masks import read_occluder
 from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.video import FrameSource, open_source
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.camera import check_object_size
 from tracking3d.config.models import ObjectConfig
-from tracking3d.config.object_size import check_object_size
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.results import layout

@@ -24,24 +24,25 @@ from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import (
+    expect_visible_masks,
     first_problem,
     read_mask,
+    try_lock,
     write_image,
     write_mask,
+    write_probability,
     write_reserved,
+    write_visible_masks,
     writing,
 )
-from tracking3d.results.lock import try_lock
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.overwrite import check_output_folder, clear_run_folder
 from tracking3d.results.pictures import Pictures
-from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.results.visible_masks import expect_visible_masks, write_visible_masks
-from tracking3d.runtime.regular_work import RegularWork
+from tracking3d.runtime.concurrency import RegularWork
 
 FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0

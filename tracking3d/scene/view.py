@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import NEAR, Camera, Window
-from tracking3d.geometry.pixel_distance import pixel_distance
+from tracking3d.geometry.camera import NEAR, Camera, Window, pixel_distance
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

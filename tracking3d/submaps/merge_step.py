@@ -39,8 +39,7 @@ from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
 from tracking3d.rendering.backend import share_threads
 from tracking3d.results import layout
 from tracking3d.results.description import RunHeader
-from tracking3d.results.files import mask_file
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import mask_file, write_probability
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.run_notes import note_in_run
@@ -60,8 +59,7 @@ from tracking3d.submaps.alignment import (
 )
 from tracking3d.submaps.job import Tell
 from tracking3d.submaps.merged_run import PartRun, move_refined_estimates, write_causal_mesh, write_merged_run
-from tracking3d.submaps.plan import PARTS, Plan, part_folder, put_cut_mask, remove_parts
-from tracking3d.submaps.plan_step import Begun
+from tracking3d.submaps.plan import PARTS, Begun, Plan, part_folder, put_cut_mask, remove_parts
 from tracking3d.submaps.submap_runs import (
     PartJob,
     Revisit,

@@ -36,7 +36,7 @@ from tracking3d.submaps.merge_step import (
     solve_together,
     weigh,
 )
-from tracking3d.submaps.plan_step import Begun, begin
+from tracking3d.submaps.plan import Begun, begin
 from tracking3d.submaps.submap_runs import PartJob, Revisit, refine_submap, track_part
 
 SideBySide = Callable[..., list[Any]]

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results import layout
-from tracking3d.results.doubtful_frames import doubtful_ranges
 from tracking3d.results.drawing import Colour
+from tracking3d.results.notes import doubtful_ranges
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline

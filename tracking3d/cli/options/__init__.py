@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from tracking3d.cli.options.general import AsJson, Debug, Quiet, Run, RunOrParent, Video, numbers
-from tracking3d.cli.options.grouping import grouped
+from tracking3d.cli.options.general import AsJson, Debug, Quiet, Run, RunOrParent, Video, grouped, numbers
 from tracking3d.cli.options.settings import (
     ConfigFile,
     Overrides,

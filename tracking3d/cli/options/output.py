@@ -13,7 +13,7 @@ from tracking3d.errors import InputError
 
 
 def _check(value: float | None) -> float | None:
-    from tracking3d.config.object_size import check_object_size
+    from tracking3d.config.camera import check_object_size
 
     return check_object_size(value)
 

@@ -204,7 +204,7 @@ class CameraOptions:
 
 
 def _parse_distortion(text: str) -> dict[str, Any]:
-    from tracking3d.calibration.calibrated_camera import as_coefficients
+    from tracking3d.calibration.camera_files import as_coefficients
 
     name, colon, values = text.rpartition(":")
     model = name.strip().casefold() if colon else "radtan"

@@ -18,8 +18,7 @@ from torch import Tensor
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import RELOCALIZED, FrameEstimate, ObjectModel, Status
-from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
-from tracking3d.estimation.known_object import KnownObject
+from tracking3d.estimation.feature_space import FeatureSpace, KnownObject, feature_channels
 from tracking3d.estimation.observation import Observation, crop, mask_box, observe
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
@@ -48,7 +47,7 @@ from tracking3d.geometry.mesh import Mesh
 from tracking3d.geometry.pose import Pose, from_matrix, pose_from_arrays
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
 from tracking3d.rendering.interpolation import interpolate
-from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.surface import sample_texture
 from tracking3d.runtime.stage_times import in_stage
 
 NOT_SEEN = "the known object has not been seen yet"
