@@ -18,7 +18,7 @@ from tracking3d.modules import (
     se3_from_matrix,
 )
 from tracking3d.rendering import SoftBand
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 
 def fit(

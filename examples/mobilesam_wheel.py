@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 from tracking3d.errors import InputError
-from tracking3d.networks.store import State, find_known, find_network, state_of
+from tracking3d.features.networks.store import State, find_known, find_network, state_of
 
 VERSION = "0.2.0"
 """That of the npm package, whose bytes the wheel holds."""

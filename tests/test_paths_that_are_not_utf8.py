@@ -87,7 +87,7 @@ with open_run(Path("run")) as writer:
             estimate = replace(estimate, status=Status.LOST, reason=f"ValueError: no such file: {sys.argv[1]}")
         writer.write(estimate, frame_of(index))
     writer.finish(model(), "finished")
-from tracking3d.report.several import write_reports
+from tracking3d.ui.report.several import write_reports
 write_reports([Path("run")])
 """
 

@@ -1,11 +1,11 @@
 """Fit how much each source counts when masks are answered once more, on finished runs of sequences with exact masks.
 
-``python training/hindsight_masks.py FOLDER --runs BENCHMARK ...`` reads the runs that ``tracking3d evaluate suite`` has
-left in ``BENCHMARK/runs`` (of any masks: trackers' ones say how they err, exact ones that they are to be kept), goes
-over their frames as the final refinement does, asks at pixels near the outlines, and some elsewhere, what the sources
-of `tracking3d.segmentation.whole_video` say and whether the object is there, fits a logistic regression
-without a constant, and writes ``tracking3d/segmentation/whole_video_weights.py``. ``FOLDER`` holds the sequences. Runs
-with exact masks count as much as all others together.
+``python training/hindsight_masks.py FOLDER --runs BENCHMARK ...`` reads the runs that ``tracking3d evaluate suite``
+has left in ``BENCHMARK/runs`` (of any masks: trackers' ones say how they err, exact ones that they are to be kept),
+goes over their frames as the final refinement does, asks at pixels near the outlines, and some elsewhere, what the
+sources of `tracking3d.estimation.segmentation.whole_video` say and whether the object is there, fits a logistic
+regression without a constant, and writes ``tracking3d/estimation/segmentation/whole_video_weights.py``. ``FOLDER``
+holds the sequences. Runs with exact masks count as much as all others together.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.segmentation.temporal_neighbours import REACH
+from tracking3d.estimation.segmentation.whole_video import PixelEvidence, VideoSegmenter
 from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.scene.view import ObjectView, crop_window
-from tracking3d.segmentation.temporal_neighbours import REACH
-from tracking3d.segmentation.whole_video import PixelEvidence, VideoSegmenter
 
 PIXELS = 400
 """Of a frame, at most; three in four of them near an outline."""

@@ -20,8 +20,8 @@ from point_uncertainty import fit
 
 from tracking3d.points.image_following import follow_in_images, image_error_features
 from tracking3d.points.pictures import Picture, open_picture
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
-from tracking3d.synthesis.procedural_texture import paint_background
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.procedural_texture import paint_background
 
 SIZE = (320, 240)
 FRAMES = 24

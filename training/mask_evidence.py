@@ -3,8 +3,9 @@
 ``python training/mask_evidence.py FOLDER ... --out DIR`` tracks every sequence (clips as ``tracking3d synth`` writes
 them) causally with the masks of a tracker, asks at pixels near either outline what the sources said and whether the
 object is there, fits a logistic regression without a constant, and prints what
-`tracking3d.segmentation.online_features` holds: first the weights of the shapes alone, by which the outline is guessed
-whose colours are compared, then all. ``--folds N`` prints before how good fits on other sequences are.
+`tracking3d.estimation.segmentation.online_features` holds: first the weights of the shapes alone, by which the
+outline is guessed whose colours are compared, then all. ``--folds N`` prints before how good fits on other sequences
+are.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from tracking3d import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.online import masks
 from tracking3d.estimation.online.masks import mask_in_window, upsampled_window
-from tracking3d.segmentation import SOURCES, as_lab, online_features, pixel_features
+from tracking3d.estimation.segmentation import SOURCES, as_lab, online_features, pixel_features
 from tracking3d_bench.benchmark.job import Job, run_job
 from tracking3d_bench.benchmark.variant import Variant
 

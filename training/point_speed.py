@@ -20,7 +20,7 @@ from scipy.spatial import HalfspaceIntersection
 from tracking3d.points.follow import follow_points
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.view import open_view
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 FRAMES, POINTS, TURNS = 24, 1000, 7
 

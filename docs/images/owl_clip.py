@@ -20,7 +20,7 @@ from owl import build_owl
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip
 from tracking3d_bench.synthesis.camera_effects import compress as encode_jpeg
 from tracking3d_bench.synthesis.camera_effects import linear
 from tracking3d_bench.synthesis.frame_rendering import render_frame

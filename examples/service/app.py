@@ -27,7 +27,7 @@ from starlette.concurrency import run_in_threadpool
 import tracking3d
 from tracking3d.errors import Tracking3dError
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.prompts.prompt import parse_box
+from tracking3d.trackers.prompts.prompt import parse_box
 from tracking3d.video import open_source
 
 

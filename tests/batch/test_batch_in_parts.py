@@ -19,8 +19,8 @@ from tracking3d.engines.choosing import InThisProcess
 from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.engines.protocol import Fault
 from tracking3d.errors import OutputError
-from tracking3d.submaps.job import SplitResult
-from tracking3d.submaps.split_run import Step
+from tracking3d.pipeline.submaps.job import SplitResult
+from tracking3d.pipeline.submaps.split_run import Step
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from tracking3d.batch.storage import absolute, join_path, local
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.results.files import write_mask
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 from tracking3d_bench.benchmark.sequences import open_dataset
 
 

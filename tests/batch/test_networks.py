@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from tracking3d.batch.video_job import VideoJob, keep_networks, share_networks
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.choosing import InThisProcess
-from tracking3d.networks.catalogue import known_networks
-from tracking3d.networks.store import VARIABLE, network_path
+from tracking3d.features.networks.catalogue import known_networks
+from tracking3d.features.networks.store import VARIABLE, network_path
 
 
 @dataclass(frozen=True)

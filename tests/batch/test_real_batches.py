@@ -22,7 +22,7 @@ from tracking3d.engines.processes import ProcessEngine
 from tracking3d.engines.protocol import Ended, Task
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 from tracking3d_bench.benchmark.job import Job
 from tracking3d_bench.benchmark.pool import run_jobs
 from tracking3d_bench.benchmark.variant import Variant

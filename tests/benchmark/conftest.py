@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from tracking3d.config.loading import load_config
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 from tracking3d_bench.benchmark.variant import Variant
 
 QUICK = ["crop.size=32", "object.frequency=2", "camera.fov=45"]

@@ -17,7 +17,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame, Prompt
 from tracking3d.pipeline.session import Session
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.trackers.crops import box_of
 
 pytestmark = pytest.mark.slow

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tracking3d.calibration.calibrate import Board
 from tracking3d.frames import Frame
+from tracking3d.geometry.calibration.calibrate import Board
 from tracking3d.geometry.lens import Lens, _picture_to_pinhole
 
 WIDTH, HEIGHT = 480, 360

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from seen_boards import HEIGHT, WIDTH, lens, view
 
-from tracking3d.calibration.calibrate import (
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.geometry.calibration.calibrate import (
     Board,
     BoardView,
     calibrate,
@@ -16,8 +18,6 @@ from tracking3d.calibration.calibrate import (
     parse_squares,
     spread_views,
 )
-from tracking3d.errors import InputError
-from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.lens import Lens
 
 BOARD = Board(7, 5, square=30.0)
@@ -122,8 +122,8 @@ def test_the_command_writes_what_run_reads(views, tmp_path, monkeypatch):
     from PIL import Image
     from typer.testing import CliRunner
 
-    from tracking3d.calibration.camera_files import read_camera
     from tracking3d.cli import app
+    from tracking3d.geometry.calibration.camera_files import read_camera
 
     monkeypatch.chdir(tmp_path)
     for one in views[:8]:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.calibration.camera_files import CalibratedCamera, read_camera, write_camera
 from tracking3d.errors import InputError
+from tracking3d.geometry.calibration.camera_files import CalibratedCamera, read_camera, write_camera
 
 COLMAP = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]

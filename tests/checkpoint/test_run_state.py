@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import JournalEntry
-from tracking3d.checkpoint.run_state import SAVED_EVERY, RunState
+from tracking3d.results.checkpoint.folder import Checkpoint
+from tracking3d.results.checkpoint.progress import JournalEntry
+from tracking3d.results.checkpoint.run_state import SAVED_EVERY, RunState
 
 
 @pytest.fixture

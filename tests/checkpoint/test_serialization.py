@@ -14,15 +14,15 @@ import torch
 from large_arrays import memory_stays_below, write_zeros
 
 from tracking3d import Frame, Session, load_config
-from tracking3d.checkpoint import serialization
-from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import JournalEntry, RunProgress, checksum
-from tracking3d.checkpoint.serialization import INLINE, NotSerializableError, TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results import layout
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.results.checkpoint import serialization
+from tracking3d.results.checkpoint.folder import Checkpoint
+from tracking3d.results.checkpoint.progress import JournalEntry, RunProgress, checksum
+from tracking3d.results.checkpoint.serialization import INLINE, NotSerializableError, TreeFolder
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 
 class Colour(StrEnum):

@@ -40,7 +40,7 @@ def heard_again() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def no_turntable(monkeypatch) -> None:
     """The movie takes longer than everything else that these runs write."""
-    monkeypatch.setattr("tracking3d.report.run_report.write_turntable", lambda *_: None)
+    monkeypatch.setattr("tracking3d.ui.report.run_report.write_turntable", lambda *_: None)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from PIL import Image
 from recorded_runs import write_run
 
 from tracking3d.geometry.camera import Camera
-from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip
 
 BOX = "run clip --box 1,2,20,20 "
 MISTAKES = (

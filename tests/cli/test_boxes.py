@@ -16,9 +16,9 @@ from tracking3d.batch.one_video import track_video
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame
-from tracking3d.prompts.boxes import parse_box
-from tracking3d.prompts.corrections import Correction, parse_correction
-from tracking3d.prompts.prompt import PromptSet, make_prompt
+from tracking3d.trackers.prompts.boxes import parse_box
+from tracking3d.trackers.prompts.corrections import Correction, parse_correction
+from tracking3d.trackers.prompts.prompt import PromptSet, make_prompt
 from tracking3d_bench.datasets.truth import Truth
 from tracking3d_bench.vot.regions import prompt_of
 

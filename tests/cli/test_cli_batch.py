@@ -151,7 +151,7 @@ def test_ctrl_c_says_that_the_same_command_goes_on(call, shots, script, opened):
 
 
 def test_a_dataset_is_tracked_from_its_boxes(call, tmp_path, script, opened):
-    from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+    from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 
     clip = synthesize(SyntheticSpec(frames=2, size=(64, 48), supersample=1))
     for name in ("one", "two"):

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 
 TRACKER = '''
 from typing import Self

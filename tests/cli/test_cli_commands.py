@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from tracking3d.config.loading import load_config
-from tracking3d.synthesis import convex_clips
+from tracking3d.testing.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
 HEAVY = {"cv2", "kornia", "numba", "numpy", "rich.progress", "scipy", "torch", "trimesh"}

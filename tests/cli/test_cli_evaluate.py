@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize, write_clip
 from tracking3d_bench.benchmark import suite as suite_module
 from tracking3d_bench.benchmark.pool import JobOutcome
 from tracking3d_bench.benchmark.results import ResultSet, write_results

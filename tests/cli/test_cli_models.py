@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.networks import store
-from tracking3d.networks.catalogue import KnownNetwork, recommended_networks
+from tracking3d.features.networks import store
+from tracking3d.features.networks.catalogue import KnownNetwork, recommended_networks
 
 BYTES = b"an ONNX network, nearly"
 
@@ -26,7 +26,7 @@ def catalogue(monkeypatch, tmp_path) -> Path:
         "closed": KnownNetwork(name="closed", licence="mine", non_commercial=True, how="ask", **common),
     }
     monkeypatch.setattr(store, "known_networks", lambda: networks)
-    monkeypatch.setattr("tracking3d.networks.catalogue.known_networks", lambda: networks)
+    monkeypatch.setattr("tracking3d.features.networks.catalogue.known_networks", lambda: networks)
     monkeypatch.setenv("TRACKING3D_CACHE", str(tmp_path / "cache"))
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
@@ -91,10 +91,10 @@ def test_get_takes_several_and_goes_on_after_one_that_fails(call, catalogue):
 
 
 def test_get_recommended_stands_for_the_recommended_networks(call, refused, catalogue, monkeypatch):
-    from tracking3d.networks.catalogue import known_networks
+    from tracking3d.features.networks.catalogue import known_networks
 
     chosen = [known_networks()["open"].model_copy(update={"recommended": True})]
-    monkeypatch.setattr("tracking3d.networks.catalogue.recommended_networks", lambda: chosen)
+    monkeypatch.setattr("tracking3d.features.networks.catalogue.recommended_networks", lambda: chosen)
     call("models", "get", "open", "--from", "fetched")
     assert call("models", "get", "recommended").stdout == f"{catalogue / 'open.onnx'}: open, MIT\n"
     assert "exactly one NAME" in refused("models", "get", "recommended", "--from", "fetched")

@@ -11,9 +11,9 @@ import pytest
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame
-from tracking3d.prompts.corrections import Correction, parse_correction, validate_corrections
-from tracking3d.prompts.points import parse_points, validate_points
-from tracking3d.prompts.prompt import make_prompt
+from tracking3d.trackers.prompts.corrections import Correction, parse_correction, validate_corrections
+from tracking3d.trackers.prompts.points import parse_points, validate_points
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from tracking3d.cli import app
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import make_demo_clip
+from tracking3d.testing.synthesis.convex_clips import make_demo_clip
 
 QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
 QUICK_TRACKER = ["--set", "tracker.segmentation_size=64"]

@@ -52,7 +52,7 @@ def test_a_report_that_fails_takes_nothing_from_the_run(call, clip, script, monk
     def fail(*_):
         raise fault
 
-    monkeypatch.setattr("tracking3d.report.several.write_reports", fail)
+    monkeypatch.setattr("tracking3d.ui.report.several.write_reports", fail)
     result = call("run", clip, *BOX)
     assert result.exit_code == code
     assert RunReader(RUN).state == "finished"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.errors import OutputError
-from tracking3d.submaps.job import SplitResult
+from tracking3d.pipeline.submaps.job import SplitResult
 
 BOX = ("--box", "20,10,20,20")
 
@@ -24,7 +24,7 @@ def parts(monkeypatch):
             raise answer
         return answer
 
-    monkeypatch.setattr("tracking3d.submaps.split_run.record_in_parts", record_in_parts)
+    monkeypatch.setattr("tracking3d.pipeline.submaps.split_run.record_in_parts", record_in_parts)
     monkeypatch.setattr("tracking3d.cli.summary.print_summary", lambda folder: print(f"summary of {folder}"))
     return asked, answers
 

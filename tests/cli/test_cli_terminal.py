@@ -15,7 +15,7 @@ import pytest
 from forked import forked_in_terminal
 
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import make_demo_clip
+from tracking3d.testing.synthesis.convex_clips import make_demo_clip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal of POSIX")
 

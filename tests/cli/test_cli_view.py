@@ -16,14 +16,14 @@ from tracking3d.cli import run as run_module
 from tracking3d.cli import view as view_module
 from tracking3d.cli.tracking import RunRequest
 from tracking3d.config.loading import load_config
-from tracking3d.picker.correction import read_outcome, save_outcome
-from tracking3d.picker.drawing import DrawnObject
-from tracking3d.picker.session import Picked
 from tracking3d.pipeline.record import RecordOptions
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results.run_reader import RunReader
-from tracking3d.viewer import opening
-from tracking3d.web.access import Access
+from tracking3d.trackers.prompts.prompt import PromptSet
+from tracking3d.ui.picker.correction import read_outcome, save_outcome
+from tracking3d.ui.picker.drawing import DrawnObject
+from tracking3d.ui.picker.session import Picked
+from tracking3d.ui.viewer import opening
+from tracking3d.ui.web.access import Access
 
 BOX = ("--box", "20,10,20,20")
 
@@ -257,7 +257,7 @@ def test_the_page_of_pick_is_served_until_the_run_is_started(clip, tmp_path, mon
 
 
 def test_the_viewer_starts_without_torch():
-    code = "import sys, tracking3d.viewer.opening; print({'torch', 'kornia', 'numba'} & set(sys.modules))"
+    code = "import sys, tracking3d.ui.viewer.opening; print({'torch', 'kornia', 'numba'} & set(sys.modules))"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout == "set()\n", "loading it takes longer than all else until the page is there"
 

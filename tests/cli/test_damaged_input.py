@@ -23,8 +23,8 @@ from tracking3d.geometry.alignment import is_rigid
 from tracking3d.geometry.camera import Camera
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import write_clip
-from tracking3d.viewer.followed_run import FollowedRun
+from tracking3d.testing.synthesis.convex_clips import write_clip
+from tracking3d.ui.viewer.followed_run import FollowedRun
 
 LONG = "x" * 300
 BOX = ("--box", "20,10,20,20")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.results.files import write_image
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 MESH = ("mesh.obj", "mesh.glb", "texture.png", "features.npz")
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame
-from tracking3d.prompts.prompt import make_prompt, parse_box
+from tracking3d.trackers.prompts.prompt import make_prompt, parse_box
 
 FRAME = Frame(0, np.zeros((48, 64, 3), dtype=np.uint8), name="000.png")
 

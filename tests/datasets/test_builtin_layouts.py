@@ -22,7 +22,7 @@ from written_datasets import (
 )
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.convex_clips import make_demo_clip
+from tracking3d.testing.synthesis.convex_clips import make_demo_clip
 from tracking3d.trackers.vot_regions import encode_mask, format_region
 from tracking3d.video import read_image
 from tracking3d_bench.datasets.layout import builtin_layouts, load_layout

@@ -13,7 +13,7 @@ import pytest
 from tracking3d.errors import InputError, OutputError
 from tracking3d.geometry.alignment import is_rigid
 from tracking3d.results.files import read_mask, write_mask
-from tracking3d.synthesis.convex_clips import SyntheticSpec, make_demo_clip, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, make_demo_clip, synthesize
 from tracking3d.video import read_image
 from tracking3d_bench.datasets.clip import read_truth
 from tracking3d_bench.evaluation.metrics import mask_iou

@@ -15,12 +15,12 @@ from documentation_pages import PAGES, ROOT, commands, label
 from tracking3d.config.loading import list_presets, load_config
 from tracking3d.config.models import OnlineConfig, PaperConfig, PipelineConfig
 from tracking3d.geometry.camera import Camera
-from tracking3d.picker.session import TRACKER_FOR
 from tracking3d.pipeline.tracker_selection import CANDIDATES
 from tracking3d.rendering import prepare_backend
 from tracking3d.results import layout
 from tracking3d.results.description import RunHeader, description_at_start, summary
 from tracking3d.results.records import FrameRecord
+from tracking3d.ui.picker.session import TRACKER_FOR
 from tracking3d_bench.evaluation.score import Scores
 
 

@@ -17,7 +17,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, Prompt
 from tracking3d.pipeline.tracker_selection import check_tracker_options
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, check_options
-from tracking3d.synthesis.convex_clips import SyntheticClip
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip
 from tracking3d.trackers.protocol import MaskTracker
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter
 
 BOX = r"--box [\d,]+"

@@ -16,7 +16,7 @@ from tracking3d.estimation.paper.solver import PaperSolver, PaperState
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 _COARSE: dict[str, Any] = {"crop": {"size": 32}, "object": {"frequency": 4, "texture_size": 32}}
 QUICK: dict[str, dict[str, Any]] = {

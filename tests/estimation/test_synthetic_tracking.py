@@ -12,7 +12,7 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline.session import SOLVERS
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import Angles, aligned_rotation_errors, mask_iou
 
 PRESETS = ["default", "rerendering"]

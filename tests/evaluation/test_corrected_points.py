@@ -14,7 +14,7 @@ from turning_sphere import turning_sphere_of, written_run
 from tracking3d.results import layout
 from tracking3d.results.point_tracking import has_landmarks, open_scene
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip
 from tracking3d.video import open_source
 from tracking3d_bench.datasets.clip import read_truth
 from tracking3d_bench.datasets.run_answers import answers_of_run

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
-from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip
 from tracking3d_bench.datasets.clip import read_truth
 from tracking3d_bench.datasets.run_answers import answers_of_run, is_refined
 from tracking3d_bench.evaluation.mask_scores import MaskScores

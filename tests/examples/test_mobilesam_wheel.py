@@ -9,7 +9,7 @@ import pytest
 from example_modules import example
 
 from tracking3d.errors import InputError
-from tracking3d.networks.store import State
+from tracking3d.features.networks.store import State
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter
 
 robot_arm = example("robot_arm")

@@ -17,7 +17,7 @@ from example_modules import example
 from fastapi import HTTPException
 
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter
 
 service = example("service/app")

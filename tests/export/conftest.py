@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tracking3d.checkpoint.progress import checksum
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.export.exporting import export_run
 from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import ellipsoid
+from tracking3d.results.checkpoint.progress import checksum
 from tracking3d.results.description import RunHeader
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter

@@ -10,11 +10,11 @@ from PIL import Image
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
-from tracking3d.prompts.prompt import read_mask_file
 from tracking3d.results.run_reader import RunReader
 from tracking3d.trackers.mask_files import CocoMasks, decompress, open_masks
 from tracking3d.trackers.mask_images import objects_in
 from tracking3d.trackers.precomputed import PrecomputedMasks
+from tracking3d.trackers.prompts.prompt import read_mask_file
 
 SIZE = (96, 128)
 ANSWERED = (0, 1, 2, 3, 5, 6)  # 4 was skipped

@@ -14,8 +14,8 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.features.kornia_descriptors import KorniaEncoder
 from tracking3d.plugins import FEATURES, VARIABLE, build_plugin
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.testing import check_encoder
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 PLUGIN = "tracking3d.features:kornia=tracking3d.features.kornia_descriptors:KorniaEncoder"
 

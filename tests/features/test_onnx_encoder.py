@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.features.onnx.encoder import (
     EncoderDescription,
     OnnxEncoder,
@@ -18,7 +19,6 @@ from tracking3d.features.onnx.encoder import (
     load_encoder_description,
 )
 from tracking3d.features.protocol import FeatureEncoder
-from tracking3d.networks.session import Network
 from tracking3d.plugins import FEATURES, build_plugin
 from tracking3d.testing import check_encoder
 

@@ -18,9 +18,9 @@ import tracking3d
 from tracking3d import Frame, PipelineConfig, Prompt, Session
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.record import record, record_objects
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.correspondences import track_points
 from tracking3d.results.run_reader import RunReader
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import LatestFrames, open_source
 
 FRAMES: dict[str, Callable[[Case], Any]] = {

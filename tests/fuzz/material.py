@@ -15,7 +15,7 @@ from PIL import Image
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.pipeline.record import record
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize, write_clip
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize, write_clip
 from tracking3d.video import VideoWriter, open_source
 
 FRAMES, WIDTH, HEIGHT = 3, 64, 48

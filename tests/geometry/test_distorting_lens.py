@@ -100,8 +100,8 @@ def test_a_camera_with_its_lens_is_kept_with_the_state_of_a_run(tmp_path):
     """As a stopped run goes on with it: equal, and still of use as a key."""
     import json
 
-    from tracking3d.checkpoint.serialization import TreeFolder
     from tracking3d.geometry.camera import Camera
+    from tracking3d.results.checkpoint.serialization import TreeFolder
 
     model, k = LENSES["barrel"]
     lens = Lens.of(model, k, TAKEN, WIDTH, HEIGHT)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from known_bytes import BYTES
 
-from tracking3d.networks.catalogue import KnownNetwork
+from tracking3d.features.networks.catalogue import KnownNetwork
 
 
 @pytest.fixture

@@ -8,8 +8,15 @@ import pytest
 from known_bytes import BYTES
 
 from tracking3d.errors import InputError
-from tracking3d.networks.catalogue import KnownNetwork, known_networks, read_catalogue
-from tracking3d.networks.store import State, cache_folder, find_network, network_path, sha256_of, state_of
+from tracking3d.features.networks.catalogue import KnownNetwork, known_networks, read_catalogue
+from tracking3d.features.networks.store import (
+    State,
+    cache_folder,
+    find_network,
+    network_path,
+    sha256_of,
+    state_of,
+)
 
 
 def test_every_network_says_what_it_is_for_and_under_which_licence():

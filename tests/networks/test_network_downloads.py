@@ -12,8 +12,8 @@ import pytest
 from known_bytes import BYTES
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.networks.download import adopt, fetch
-from tracking3d.networks.store import network_path
+from tracking3d.features.networks.download import adopt, fetch
+from tracking3d.features.networks.store import network_path
 
 
 def files_in(cache: Path) -> list[str]:
@@ -247,7 +247,7 @@ def test_a_cache_that_is_a_file_is_told(cache, network, serve):
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(cache, network, serve, monkeypatch):
-    from tracking3d.networks import download
+    from tracking3d.features.networks import download
 
     class Full:
         def __init__(self, part):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.networks import session
-from tracking3d.networks.session import Network
+from tracking3d.features.networks import session
+from tracking3d.features.networks.session import Network
 
 onnx = pytest.importorskip("onnx")
 node, value = onnx.helper.make_node, onnx.helper.make_tensor_value_info

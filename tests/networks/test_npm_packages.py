@@ -13,9 +13,9 @@ import pytest
 from known_bytes import BYTES
 
 from tracking3d.errors import InputError
-from tracking3d.networks import download
-from tracking3d.networks.download import fetch
-from tracking3d.networks.store import network_path
+from tracking3d.features.networks import download
+from tracking3d.features.networks.download import fetch
+from tracking3d.features.networks.store import network_path
 
 OTHER = BYTES[::-1]
 

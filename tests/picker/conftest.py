@@ -15,13 +15,13 @@ from recorded_runs import write_frames
 from tracking3d.cli.options import configure as configured
 from tracking3d.config.loading import load_config
 from tracking3d.frames import MaskEstimate
-from tracking3d.picker import session as session_module
-from tracking3d.picker.correction import command_of, save_outcome, settings_as_yaml
-from tracking3d.picker.server import Picker
-from tracking3d.picker.session import ChosenSettings, PickingSession, SettingsMenu
+from tracking3d.ui.picker import session as session_module
+from tracking3d.ui.picker.correction import command_of, save_outcome, settings_as_yaml
+from tracking3d.ui.picker.server import Picker
+from tracking3d.ui.picker.session import ChosenSettings, PickingSession, SettingsMenu
+from tracking3d.ui.web.access import Access
 from tracking3d.video import open_source
 from tracking3d.video.any_frame import frame_images
-from tracking3d.web.access import Access
 
 
 class TakesWhatItIsGiven:

@@ -12,9 +12,9 @@ from raw_requests import raw_request, request, status
 from test_picker_server import BOX, POINTS, body, post, whole
 
 from tracking3d.errors import InputError
-from tracking3d.picker.correction import CorrectionPage
-from tracking3d.picker.server import PageProgress
-from tracking3d.web.access import Access
+from tracking3d.ui.picker.correction import CorrectionPage
+from tracking3d.ui.picker.server import PageProgress
+from tracking3d.ui.web.access import Access
 
 NOTHING = {**BOX, "box": None}
 PAINT = {"path": [[80, 10]], "radius": 4, "on": True}

@@ -13,9 +13,9 @@ from recorded_runs import frame_of
 from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
-from tracking3d.picker.correction import command_of, save_outcome
-from tracking3d.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse_object, read_drawing
-from tracking3d.picker.session import Picked, drawn_mask
+from tracking3d.ui.picker.correction import command_of, save_outcome
+from tracking3d.ui.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse_object, read_drawing
+from tracking3d.ui.picker.session import Picked, drawn_mask
 
 OBJECT = {"name": "cup", "colour": "#00a5e0", "frame": 0}
 

@@ -11,9 +11,9 @@ import time
 import pytest
 from raw_requests import raw_request, request, status
 
-from tracking3d.picker import server as server_module
-from tracking3d.picker.server import LARGEST_BODY, MOST_CONNECTIONS, Picker
-from tracking3d.web.access import Access
+from tracking3d.ui.picker import server as server_module
+from tracking3d.ui.picker.server import LARGEST_BODY, MOST_CONNECTIONS, Picker
+from tracking3d.ui.web.access import Access
 
 BOX = {"name": "cup", "colour": "#00a5e0", "frame": 0, "box": [30, 20, 36, 24]}
 POINTS = {**BOX, "box": None, "points": [{"x": 48, "y": 32, "on": True}]}

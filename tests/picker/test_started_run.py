@@ -12,9 +12,9 @@ from recorded_runs import write_run
 from test_picker_in_browser import SHOWN, drag
 from test_picker_server import BOX, body, post, whole
 
-from tracking3d.picker import server as server_module
-from tracking3d.picker.server import PageProgress, Picker, ShownRun
 from tracking3d.results import layout
+from tracking3d.ui.picker import server as server_module
+from tracking3d.ui.picker.server import PageProgress, Picker, ShownRun
 
 
 @pytest.fixture

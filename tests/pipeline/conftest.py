@@ -9,7 +9,7 @@ from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.results.files import write_image
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from tracking3d import Frame, Session, load_config, track, track_objects
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import MaskEstimate
 from tracking3d.plugins import VARIABLE
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.rendering.kernels import compilation as kernels
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 SETTINGS = [
     "crop.size=32",

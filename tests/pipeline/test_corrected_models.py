@@ -9,20 +9,20 @@ import pytest
 from refining_solver import StandInSolver
 
 from tracking3d import load_config
-from tracking3d.checkpoint import folder
-from tracking3d.checkpoint.staging import take_over
 from tracking3d.errors import InputError
 from tracking3d.pipeline import correct
 from tracking3d.pipeline.correct import correct_run, replaced_by_correction
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.prompts.corrections import Correction
 from tracking3d.reconstruction import rebuild
 from tracking3d.results import layout
+from tracking3d.results.checkpoint import folder
+from tracking3d.results.checkpoint.staging import take_over
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.corrections import Correction
 from tracking3d.video import open_source
 
 FRAMES = 4

@@ -13,18 +13,18 @@ from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import Stopped, assert_alike, files_of, settings
 
-from tracking3d.checkpoint import folder, staging
-from tracking3d.checkpoint import folder as checkpoint_folder
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.pipeline.correct import correct_run, object_folders_of
 from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
+from tracking3d.results.checkpoint import folder, staging
+from tracking3d.results.checkpoint import folder as checkpoint_folder
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import visible_side
+from tracking3d.trackers.prompts.corrections import Correction
 from tracking3d.video import open_source
 
 FRAMES, CORRECTED = 8, 6

@@ -16,9 +16,9 @@ from tracking3d.frames import Frame
 from tracking3d.pipeline.correct import correct_run, object_folders_of
 from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS
-from tracking3d.prompts.corrections import Correction, parse_correction, validate_corrections
 from tracking3d.results.files import write_image
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.corrections import Correction, parse_correction, validate_corrections
 from tracking3d.video import open_source
 from tracking3d.video.source import known_indices
 from tracking3d.video.writer import VideoWriter

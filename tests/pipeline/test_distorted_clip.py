@@ -10,7 +10,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.geometry.lens import Lens, _picture_to_pinhole
 from tracking3d.pipeline.record import record
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 K = (-0.28, 0.08, 0.001, -0.001)

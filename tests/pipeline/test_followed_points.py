@@ -8,7 +8,7 @@ import pytest
 from tracking3d import load_config, track
 from tracking3d.errors import InputError
 from tracking3d.pipeline.point_queries import validate_queries
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 SETTINGS = [
     "crop.size=64",

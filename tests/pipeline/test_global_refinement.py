@@ -21,7 +21,6 @@ from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.plugins.guard import PluginFailure
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
@@ -29,7 +28,8 @@ from tracking3d.results.overlay import OverlaySize
 from tracking3d.results.records import FrameRecord, latest
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.results.run_writer import FrameLines
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import open_source
 
 FRAMES = 5

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from tracking3d.estimation.segmentation.whole_video import SegmentedMask
 from tracking3d.frames import Frame
 from tracking3d.geometry.lens import Lens
 from tracking3d.pipeline.refinement_steps import RefinementSteps
-from tracking3d.segmentation.whole_video import SegmentedMask
 
 SIZE = (90, 120)
 INTRINSICS = 100.0, 100.0, 59.5, 44.5

@@ -19,12 +19,12 @@ from refining_solver import StandInSolver
 from resumable_runs import assert_alike, finished_frames
 
 from tracking3d import load_config
-from tracking3d.checkpoint.run_state import SAVED_EVERY
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
+from tracking3d.results.checkpoint.run_state import SAVED_EVERY
 from tracking3d.results.layout import CAUSAL, has_state
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")

@@ -11,7 +11,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.frames import Frame, Prompt
 from tracking3d.pipeline.track import SOLVERS, Session
 from tracking3d.runtime.memory import resident_memory
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 FRAMES, SETTLED = 3000, 300
 ALLOWED = 15.0

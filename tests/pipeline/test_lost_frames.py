@@ -16,10 +16,10 @@ from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.lost_frames import SecondStart, plan_gaps
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import Session
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import open_source
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

@@ -13,8 +13,8 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.pipeline.open_tracking import NoFrameError, open_tracking, request_tracking
 from tracking3d.pipeline.record import RecordOptions, record_tracking
-from tracking3d.prompts.corrections import Correction
-from tracking3d.prompts.prompt import PromptSet
+from tracking3d.trackers.prompts.corrections import Correction
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 
 SIZE = 48, 64

@@ -11,19 +11,19 @@ from refining_solver import CausalSolver, StandInSolver
 from scipy.spatial.transform import Rotation
 
 from tracking3d import load_config
-from tracking3d.checkpoint import folder
 from tracking3d.estimation.solver import RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.correct import correct_run
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
+from tracking3d.results.checkpoint import folder
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import StageProgress, listen_to_progress
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.corrections import Correction
 from tracking3d.video import open_source
 
 FRAMES, CORRECTED = 8, 6

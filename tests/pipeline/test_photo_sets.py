@@ -18,7 +18,7 @@ from tracking3d.pipeline.record import record
 from tracking3d.results.files import write_image
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

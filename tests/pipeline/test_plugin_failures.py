@@ -17,7 +17,7 @@ from tracking3d.pipeline.record import record
 from tracking3d.plugins import VARIABLE
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FILE = Path(__file__).parent / "failing_plugins.py"

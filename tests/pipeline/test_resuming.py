@@ -15,8 +15,6 @@ from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import Stopped, assert_alike, files_of, settings, stop_at
 
 from tracking3d import load_config
-from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.geometry.camera import Camera
@@ -24,12 +22,14 @@ from tracking3d.pipeline.open_tracking import request_tracking
 from tracking3d.pipeline.record import RecordOptions, record, record_objects, record_tracking
 from tracking3d.pipeline.recorder import ObjectRecorder
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout, run_writer
+from tracking3d.results.checkpoint.folder import Checkpoint
+from tracking3d.results.checkpoint.run_state import RunState
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import FrameLines
 from tracking3d.trackers.flow import FlowTracker
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 
 pytestmark = pytest.mark.usefixtures("stand_in_solver")

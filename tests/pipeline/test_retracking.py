@@ -15,7 +15,7 @@ from tracking3d.pipeline.refinement_steps import RefinementSteps
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FRAMES, DOUBTFUL, MOVED = 8, 3, 6

@@ -17,7 +17,7 @@ from tracking3d.results.description import time_per_frame
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import STAGES, StageTimes, in_stage, measure
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
 

@@ -11,7 +11,6 @@ from refining_solver import StandInSolver
 from resumable_runs import Stopped, assert_alike, settings
 
 import tracking3d
-from tracking3d.checkpoint.folder import finish_state
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.solver import OnlineSolver
@@ -19,13 +18,14 @@ from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS, Session
-from tracking3d.prompts.corrections import Correction
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.folder import finish_state
 from tracking3d.results.files import write_mask
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.corrections import Correction
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import both_ways as both_ways_module
 from tracking3d.video import open_source
 from tracking3d.video.both_ways import both_ways

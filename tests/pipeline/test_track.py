@@ -17,8 +17,8 @@ from tracking3d.config.models import CameraConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.track import choose_camera
-from tracking3d.prompts.prompt import make_prompt
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 QUICK = [
     "crop.size=32",

@@ -12,8 +12,8 @@ from refining_solver import StandInSolver
 import tracking3d
 from tracking3d import PipelineConfig, load_config
 from tracking3d.errors import PluginError
+from tracking3d.features.networks.store import VARIABLE
 from tracking3d.frames import Frame, Prompt
-from tracking3d.networks.store import VARIABLE
 from tracking3d.pipeline import tracker_selection
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session

@@ -26,7 +26,7 @@ from tracking3d.rendering.kernels import compilation as kernels
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import visible_side
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 SETTINGS = [

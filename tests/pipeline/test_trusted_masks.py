@@ -10,7 +10,7 @@ from tracking3d import Status
 from tracking3d.pipeline.record import record
 from tracking3d.results.files import write_mask
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FRAMES = 14

@@ -14,7 +14,7 @@ from PIL import Image
 from tracking3d import Frame, PipelineConfig, Prompt, Session, load_config, track, track_objects
 from tracking3d.errors import InputError, OutputError, argument
 from tracking3d.pipeline.record import record, record_objects
-from tracking3d.prompts.prompt import make_prompt
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import LatestFrames, open_source
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)

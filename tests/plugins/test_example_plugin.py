@@ -13,7 +13,7 @@ import pytest
 from forked import forked_program
 
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import make_demo_clip
+from tracking3d.testing.synthesis.convex_clips import make_demo_clip
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
-from tracking3d.synthesis.convex_clips import SyntheticClip
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip
 
 
 def mesh_of(clip: SyntheticClip) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

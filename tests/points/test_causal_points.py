@@ -9,7 +9,7 @@ from solid_of_clip import mesh_of
 from tracking3d.points.answers import PointAnswers
 from tracking3d.points.online import KEPT, CausalPoints
 from tracking3d.points.view import open_view
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 FRAMES = 9
 

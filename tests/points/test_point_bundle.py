@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from twins import ray_intersection
 
-from tracking3d.bundle_adjustment.adjustment import reversal_of
+from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, other_way_round
 
 RNG = np.random.default_rng(3)

@@ -12,7 +12,7 @@ from tracking3d.points.image_only import UncoveredPoints
 from tracking3d.points.online import KEPT, CausalPoints
 from tracking3d.points.pictures import open_picture
 from tracking3d.points.view import open_view
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 FRAMES = 9
 SMALL = 0.5

@@ -10,11 +10,11 @@ import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import reversal_of
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, LENS_KNOWN, Camera
 from tracking3d.points import landmark_adjustment
+from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.points.warping import Chain
 from tracking3d.reconstruction import global_adjustment
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment

@@ -12,7 +12,6 @@ import pytest
 from rendered_views import CAMERA, SIDE, ball, pattern, pose, seen
 from typer.testing import CliRunner
 
-from tracking3d.checkpoint.progress import checksum
 from tracking3d.cli import app
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, Status
@@ -20,12 +19,13 @@ from tracking3d.frames import Frame
 from tracking3d.reconstruction import rebuild
 from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
 from tracking3d.reconstruction.shape import ReconstructedShape
-from tracking3d.report import run_report
-from tracking3d.report.run_report import write_report
+from tracking3d.results.checkpoint.progress import checksum
 from tracking3d.results.description import RunHeader
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import find_seen_vertices, load_model
 from tracking3d.results.run_writer import RunWriter
+from tracking3d.ui.report import run_report
+from tracking3d.ui.report.run_report import write_report
 
 YAWS = (0, 15, 30)
 

@@ -18,7 +18,7 @@ from tracking3d.reconstruction import bake_texture, texturing
 from tracking3d.reconstruction.meshing import unwrap
 from tracking3d.reconstruction.texturing import fill_holes, texture_size
 from tracking3d.rendering import TexelMap, sample_texture
-from tracking3d.report.run_report import model_data
+from tracking3d.ui.report.run_report import model_data
 
 YAWS = (-40, -20, 0, 20, 40)
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from tracking3d.report.curves import HEIGHT, MOST_POINTS, WIDTH, curve, path_of, stretches
+from tracking3d.ui.report.curves import HEIGHT, MOST_POINTS, WIDTH, curve, path_of, stretches
 
 
 def points(path: str) -> list[tuple[float, float]]:

@@ -14,8 +14,8 @@ from turning_sphere import TurningSphere, turning_sphere_of, written_run
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.geometry.camera import Camera
-from tracking3d.report.comparison import write_comparison
-from tracking3d.report.differences import Difference, compare_runs, worst_frames
+from tracking3d.ui.report.comparison import write_comparison
+from tracking3d.ui.report.differences import Difference, compare_runs, worst_frames
 
 FRAMES = 12
 

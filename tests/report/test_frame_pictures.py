@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from turning_sphere import turning_sphere_of, written_run
 
-from tracking3d.report.frame_pictures import BUDGET, NARROWEST, frame_pictures
 from tracking3d.results.run_reader import RunReader
+from tracking3d.ui.report.frame_pictures import BUDGET, NARROWEST, frame_pictures
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,12 @@ import pytest
 from hostile import HOSTILE
 from turning_sphere import turning_sphere_of, written_run
 
-from tracking3d.report import run_report
-from tracking3d.report.comparison import write_comparison
-from tracking3d.report.differences import compare_runs
-from tracking3d.report.run_report import write_report
 from tracking3d.results.files import write_probability
 from tracking3d.results.run_reader import RunReader
+from tracking3d.ui.report import run_report
+from tracking3d.ui.report.comparison import write_comparison
+from tracking3d.ui.report.differences import compare_runs
+from tracking3d.ui.report.run_report import write_report
 
 PHONE = {"width": 390, "height": 844}
 WHITE, DARK = "rgb(251, 251, 249)", "rgb(19, 20, 22)"

@@ -14,7 +14,7 @@ from tracking3d.results.description import RunHeader
 from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 FRAMES = 12

@@ -17,11 +17,11 @@ from tracking3d import load_config
 from tracking3d.pipeline.correct import correct_run
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS
-from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import read_probability, write_image, write_probability
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.corrections import Correction
 from tracking3d.video import open_source
 
 FRAMES = 3

@@ -10,8 +10,8 @@ import pytest
 
 from tracking3d.cli.summary import advise_networks, print_summary
 from tracking3d.estimation.estimate import MaskSource, lost_estimate
+from tracking3d.features.networks.catalogue import recommended_networks
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.networks.catalogue import recommended_networks
 from tracking3d.results.contact_sheet import CROPS, TILE
 from tracking3d.results.notes import describe_camera_and_model, notes_of_run, notes_of_times, unseen_share
 from tracking3d.results.records import FrameRecord

@@ -8,9 +8,9 @@ import twins.colour_models as plain_colours
 import twins.motion_cue as plain_motion
 import twins.soft_visual_hull as plain_hull
 
+from tracking3d.estimation.segmentation import colour_models, motion_cue, soft_visual_hull
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.scene.surface import Drawn
-from tracking3d.segmentation import colour_models, motion_cue, soft_visual_hull
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 rng = np.random.default_rng(0)

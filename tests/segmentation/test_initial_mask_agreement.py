@@ -9,11 +9,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from tracking3d.estimation.segmentation.initial_mask_agreement import InitialMaskAgreement
+from tracking3d.estimation.segmentation.whole_video import VideoSegmenter, draw_around_masks, segment_all
 from tracking3d.geometry.camera import Camera
 from tracking3d.scene.surface import Drawn, draw_depth
 from tracking3d.scene.view import ObjectView
-from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement
-from tracking3d.segmentation.whole_video import VideoSegmenter, draw_around_masks, segment_all
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 BLOCK = trimesh.creation.box((2.4, 0.8, 1.2))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.segmentation import (
+from tracking3d.estimation.segmentation import (
     SOURCES,
     ColourModels,
     as_lab,
@@ -117,7 +117,7 @@ def test_colours_are_learnt_slowly_and_need_both_sides():
 
 def test_without_the_smoother_the_log_odds_decide(monkeypatch):
     monkeypatch.setattr(
-        "tracking3d.segmentation.mask_extraction.why_no_contrib", lambda name: "it is not there"
+        "tracking3d.estimation.segmentation.mask_extraction.why_no_contrib", lambda name: "it is not there"
     )
     odds = np.where(disc(64), 2.0, -2.0).astype(np.float32)
     np.testing.assert_array_equal(snap_to_edges(picture(disc(40)), odds) > 0, disc(64))

@@ -8,9 +8,7 @@ import pytest
 import trimesh
 from twins import motion_cue
 
-from tracking3d.geometry.camera import Window
-from tracking3d.scene.surface import draw_depth
-from tracking3d.segmentation.online_motion_cue import (
+from tracking3d.estimation.segmentation.online_motion_cue import (
     MOVES,
     MotionReference,
     grow_region,
@@ -18,7 +16,9 @@ from tracking3d.segmentation.online_motion_cue import (
     online_motion_log_odds,
     unlike_surroundings,
 )
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.geometry.camera import Window
+from tracking3d.scene.surface import draw_depth
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 SIZE = 128
 
@@ -83,7 +83,9 @@ def test_a_side_that_turns_into_view_moves_along_and_the_background_does_not(tur
 
 def test_it_says_the_same_without_the_kernel(turning, monkeypatch):
     fast = asked(turning, 4)[0]
-    monkeypatch.setattr("tracking3d.segmentation.online_motion_cue.motion_parallax", motion_cue.parted_ways)
+    monkeypatch.setattr(
+        "tracking3d.estimation.segmentation.online_motion_cue.motion_parallax", motion_cue.parted_ways
+    )
     assert np.mean(np.abs(fast - asked(turning, 4)[0]) > 0.02) < 0.01  # where rounding decides
 
 

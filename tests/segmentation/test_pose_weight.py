@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tracking3d.estimation.segmentation.pose_weight import (
+    blend_with_initial,
+    pose_weight,
+    relative_confidence,
+)
 from tracking3d.frames import TRACKED_CONFIDENCE
-from tracking3d.segmentation.pose_weight import blend_with_initial, pose_weight, relative_confidence
 
 
 def test_a_pose_that_is_as_likely_wrong_as_right_redraws_nothing():

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from tracking3d.geometry.camera import Camera
-from tracking3d.scene.surface import Drawn
-from tracking3d.scene.view import ObjectView
-from tracking3d.segmentation import whole_video
-from tracking3d.segmentation.motion_cue import background_motion, flow_distance, motion_cue, small_grey
-from tracking3d.segmentation.soft_visual_hull import SoftVisualHull
-from tracking3d.segmentation.temporal_neighbours import TemporalNeighbours
-from tracking3d.segmentation.whole_video import (
+from tracking3d.estimation.segmentation import whole_video
+from tracking3d.estimation.segmentation.motion_cue import (
+    background_motion,
+    flow_distance,
+    motion_cue,
+    small_grey,
+)
+from tracking3d.estimation.segmentation.soft_visual_hull import SoftVisualHull
+from tracking3d.estimation.segmentation.temporal_neighbours import TemporalNeighbours
+from tracking3d.estimation.segmentation.whole_video import (
     PixelEvidence,
     VideoSegmenter,
     alignment,
@@ -24,7 +26,10 @@ from tracking3d.segmentation.whole_video import (
     edge_strength,
     segment_all,
 )
-from tracking3d.segmentation.whole_video_weights import WEIGHTS
+from tracking3d.estimation.segmentation.whole_video_weights import WEIGHTS
+from tracking3d.geometry.camera import Camera
+from tracking3d.scene.surface import Drawn
+from tracking3d.scene.view import ObjectView
 from tracking3d.trackers.outline import inside_distance
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)

@@ -9,8 +9,8 @@ import pytest
 
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
-from tracking3d.submaps.cuts import Sighting, cuts_in, overlap_of, parse_length, parts_at, windows
-from tracking3d.submaps.plan import stride_of, tracker_for_looking
+from tracking3d.pipeline.submaps.cuts import Sighting, cuts_in, overlap_of, parse_length, parts_at, windows
+from tracking3d.pipeline.submaps.plan import stride_of, tracker_for_looking
 
 
 def steady(count: int, **changed: dict[int, object]) -> list[Sighting]:

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.submaps.split_run import run_in_processes
+from tracking3d.pipeline.submaps.split_run import run_in_processes
 
 
 def where(tell, job):

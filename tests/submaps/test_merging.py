@@ -21,11 +21,8 @@ from tracking3d.frames import Prompt
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.components import build_encoder
-from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_mask, write_visible_masks
-from tracking3d.results.run_writer import write_initial_mask
-from tracking3d.submaps import merge_step, merged_run
-from tracking3d.submaps.alignment import (
+from tracking3d.pipeline.submaps import merge_step, merged_run
+from tracking3d.pipeline.submaps.alignment import (
     DisagreementError,
     align_submaps,
     by_lens,
@@ -35,8 +32,11 @@ from tracking3d.submaps.alignment import (
     in_space,
     through_lens,
 )
-from tracking3d.submaps.merge_step import merge_submap_states
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.pipeline.submaps.merge_step import merge_submap_states
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask, write_mask, write_visible_masks
+from tracking3d.results.run_writer import write_initial_mask
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 
 TURN = Similarity(Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), 1.7, np.array([0.1, -0.2, 0.15]))
 """From the second part's object to the first's."""

@@ -12,19 +12,19 @@ from typing import Any
 import pytest
 
 from tracking3d import load_config
-from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.config.models import PipelineConfig
 from tracking3d.pipeline.record import record
-from tracking3d.prompts.prompt import PromptSet
+from tracking3d.pipeline.submaps.job import LongVideo
+from tracking3d.pipeline.submaps.merge_step import MergedSubmaps
+from tracking3d.pipeline.submaps.plan import Begun, Plan
+from tracking3d.pipeline.submaps.split_run import Step, steps_to_the_end
+from tracking3d.pipeline.submaps.submap_runs import Revisit
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.folder import Checkpoint
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
-from tracking3d.submaps.job import LongVideo
-from tracking3d.submaps.merge_step import MergedSubmaps
-from tracking3d.submaps.plan import Begun, Plan
-from tracking3d.submaps.split_run import Step, steps_to_the_end
-from tracking3d.submaps.submap_runs import Revisit
-from tracking3d.synthesis.convex_clips import SyntheticSpec, degrade_masks, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, degrade_masks, synthesize
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 
 FRAMES = 18

@@ -8,7 +8,7 @@ from parts_of_runs import degrees_between, inverse, turning
 from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.similarity import Similarity
-from tracking3d.submaps.alignment import fit_similarity
+from tracking3d.pipeline.submaps.alignment import fit_similarity
 
 
 def known(seed: int) -> Similarity:

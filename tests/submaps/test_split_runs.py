@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from tracking3d import load_config
-from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
 from tracking3d.pipeline.record import record
-from tracking3d.prompts.prompt import PromptSet
+from tracking3d.pipeline.submaps import merge_step, plan, split_run
+from tracking3d.pipeline.submaps.alignment import DisagreementError
+from tracking3d.pipeline.submaps.job import SplitResult
+from tracking3d.pipeline.submaps.plan import PARTS
+from tracking3d.pipeline.submaps.split_run import record_in_parts
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.folder import Checkpoint
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.submaps import merge_step, plan, split_run
-from tracking3d.submaps.alignment import DisagreementError
-from tracking3d.submaps.job import SplitResult
-from tracking3d.submaps.plan import PARTS
-from tracking3d.submaps.split_run import record_in_parts
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.convex_clips import SURFACES, SyntheticSpec, degrade_masks, synthesize
+from tracking3d.testing.synthesis.convex_clips import SURFACES, SyntheticSpec, degrade_masks, synthesize
 from tracking3d_bench.evaluation.metrics import mask_iou
 
 QUICK = SyntheticSpec(frames=6, size=(160, 120), supersample=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.synthesis.convex_raycast import Ellipsoid, Polyhedron
+from tracking3d.testing.synthesis.convex_raycast import Ellipsoid, Polyhedron
 
 AHEAD = np.array([[0.0, 0.0, 1.0]])
 

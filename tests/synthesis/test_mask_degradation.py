@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import mask_iou
 from tracking3d_bench.synthesis.mask_degradation import Faults, degrade_to_iou
 

@@ -17,7 +17,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_mask
-from tracking3d.synthesis.convex_clips import write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip
 from tracking3d_bench.benchmark.job import RUN, Job
 from tracking3d_bench.benchmark.variant import Variant
 

@@ -187,7 +187,7 @@ def test_a_short_training_writes_a_network_that_the_encoder_can_run(tmp_path):
     pytest.importorskip("onnx", reason="the export needs the package onnx")
     from export import export
     from recipe import read_recipe
-    from tracking3d.networks.session import Network
+    from tracking3d.features.networks.session import Network
     from train import train
 
     pictures = tmp_path / "photographs"

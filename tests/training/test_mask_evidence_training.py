@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.segmentation import SOURCES, pixel_features
+from tracking3d.estimation.segmentation import SOURCES, pixel_features
 
 
 @pytest.fixture(scope="module")

@@ -139,7 +139,7 @@ def test_a_network_that_begins_with_exported_weights_answers_as_the_exported_one
     from first_weights import load_exported
     from network import CHANNELS, SegmentationNetwork
     from scene_sequences import CANVAS, PLANES
-    from tracking3d.networks.session import Network
+    from tracking3d.features.networks.session import Network
 
     samples = np.random.default_rng(0).integers(0, 255, (4, len(PLANES), CANVAS, CANVAS), dtype=np.uint8)
     np.save(tmp_path / "train_0000.npy", samples)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from script_folders import scripts_of
 
-from tracking3d.segmentation import whole_video_weights
+from tracking3d.estimation.segmentation import whole_video_weights
 
 with scripts_of(Path(__file__).resolve().parents[2] / "training"):
     import hindsight_masks

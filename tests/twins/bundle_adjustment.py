@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System, _damp
-from tracking3d.bundle_adjustment.reprojection import (
+from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System, _damp
+from tracking3d.points.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
     project_camera_points,

@@ -24,7 +24,7 @@ def local_shares(
 
 
 def alike_around(labels: NDArray[np.uint8], mask: NDArray[np.bool_], radius: int) -> NDArray[np.float32]:
-    """See `tracking3d.segmentation.colour_models.alike_around`."""
+    """See `tracking3d.estimation.segmentation.colour_models.alike_around`."""
     sides = np.stack([mask, ~mask]).astype(np.float32)
     total = np.maximum(np.stack([cv2.blur(one, (2 * radius + 1,) * 2) for one in sides]), 0.02)
     return local_shares(labels, labels, sides[0], radius) / total

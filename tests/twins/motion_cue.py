@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.estimation.segmentation.motion_cue import Matrix, _carry_through, _project
 from tracking3d.scene.view import Plane
-from tracking3d.segmentation.motion_cue import Matrix, _carry_through, _project
 
 
 def parted_ways(
@@ -16,7 +16,7 @@ def parted_ways(
     image_size: tuple[int, int],
     apart: tuple[float, float],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """See `tracking3d.segmentation.motion_cue.motion_parallax`."""
+    """See `tracking3d.estimation.segmentation.motion_cue.motion_parallax`."""
     near = inverse_depth[..., None]
     moved = _carry_through(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
     beyond = _carry_through(len(inverse_depth), of_background)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.reprojection import (
+from tracking3d.estimation.online.optimization.pnp import _shares
+from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
+from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
+from tracking3d.points.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
     apply_pose_steps,
@@ -12,10 +16,6 @@ from tracking3d.bundle_adjustment.reprojection import (
     project_camera_points,
     transform_to_camera,
 )
-from tracking3d.estimation.online.optimization.pnp import _shares
-from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
-from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
-from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
 from twins.reprojection import pixel_by_point, pixel_by_pose
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.reprojection import NEAREST, FloatArray
+from tracking3d.points.bundle_adjustment.reprojection import NEAREST, FloatArray
 
 
 def pixel_by_point(x_cam: FloatArray, K: FloatArray) -> FloatArray:

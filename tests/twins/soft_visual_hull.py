@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.segmentation.soft_visual_hull import _NEAR, _UNKNOWN, CELLS
+from tracking3d.estimation.segmentation.soft_visual_hull import _NEAR, _UNKNOWN, CELLS
 
 
 def carried(
@@ -17,7 +17,7 @@ def carried(
     by_depth: float,
     beyond: float,
 ) -> NDArray[np.int8] | None:
-    """See `tracking3d.segmentation.soft_visual_hull.sample_grid_distances`."""
+    """See `tracking3d.estimation.segmentation.soft_visual_hull.sample_grid_distances`."""
     z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
     u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
     if (depth <= _NEAR).any():
@@ -42,7 +42,7 @@ def marched(
     focal: float,
     beyond: float,
 ) -> NDArray[np.float32]:
-    """See `tracking3d.segmentation.soft_visual_hull.march_rays`."""
+    """See `tracking3d.estimation.segmentation.soft_visual_hull.march_rays`."""
     cells = origin + depths[:, None, None, None] * rays
     grid = torch.from_numpy((2 * cells + 1) / np.float32(len(hulls)) - 1)
     signed = torch.from_numpy(hulls[..., : hulls.shape[-1] // 2])

@@ -24,10 +24,10 @@ from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.export.options import ExportOptions
 from tracking3d.frames import MaskEstimate
 from tracking3d.pipeline.record import record, record_objects
-from tracking3d.prompts.corrections import Correction
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.correspondences import PointTracks
 from tracking3d.results.run_reader import RunReader
+from tracking3d.trackers.prompts.corrections import Correction
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video import open_source
 
 

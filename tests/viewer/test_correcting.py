@@ -16,15 +16,15 @@ pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[vi
 
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
-from tracking3d.picker.correction import DrawnCorrection
 from tracking3d.results import layout
+from tracking3d.ui.picker.correction import DrawnCorrection
+from tracking3d.ui.viewer import correcting
+from tracking3d.ui.viewer.correcting import Corrections, RunCorrection
+from tracking3d.ui.viewer.followed_run import FollowedRun
+from tracking3d.ui.viewer.opening import open_viewer
+from tracking3d.ui.viewer.run_images import LatestImages
+from tracking3d.ui.web.access import Access
 from tracking3d.video import open_source
-from tracking3d.viewer import correcting
-from tracking3d.viewer.correcting import Corrections, RunCorrection
-from tracking3d.viewer.followed_run import FollowedRun
-from tracking3d.viewer.opening import open_viewer
-from tracking3d.viewer.run_images import LatestImages
-from tracking3d.web.access import Access
 
 
 class Frames:

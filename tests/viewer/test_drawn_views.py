@@ -12,11 +12,11 @@ from recorded_runs import append_lines, frame_of
 
 from tracking3d.estimation.estimate import FREE_ROTATION
 from tracking3d.results import drawing
+from tracking3d.ui.viewer import descriptions, timeline
+from tracking3d.ui.viewer.followed_run import FollowedRun
+from tracking3d.ui.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
+from tracking3d.ui.viewer.run_images import LatestImages, OverlayPictures, images_of_run
 from tracking3d.video import open_source
-from tracking3d.viewer import descriptions, timeline
-from tracking3d.viewer.followed_run import FollowedRun
-from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
-from tracking3d.viewer.run_images import LatestImages, OverlayPictures, images_of_run
 
 pytestmark = pytest.mark.usefixtures("as_users_see_it")
 

@@ -10,7 +10,7 @@ from recorded_runs import model
 
 from tracking3d.results import drawing
 from tracking3d.results.overlay import ObjectAxes
-from tracking3d.viewer.first_look import (
+from tracking3d.ui.viewer.first_look import (
     ASPECT,
     FOV,
     NARROW,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from recorded_runs import estimate_of, frame_of, model, open_run, write_run
 
-from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.viewer.followed_run import FollowedRun, landmarks_of_checkpoint, open_followed_runs
+from tracking3d.results.checkpoint.serialization import TreeFolder
+from tracking3d.ui.viewer.followed_run import FollowedRun, landmarks_of_checkpoint, open_followed_runs
 
 
 def followed(folder: Path) -> FollowedRun:

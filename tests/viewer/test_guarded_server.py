@@ -18,9 +18,9 @@ import websockets.exceptions
 from websockets.sync.client import connect
 
 from tracking3d.errors import PluginError
-from tracking3d.viewer import guarded_server
-from tracking3d.viewer.guarded_server import LARGEST_MESSAGE, MOST_CONNECTIONS, start_server
-from tracking3d.web.access import Access
+from tracking3d.ui.viewer import guarded_server
+from tracking3d.ui.viewer.guarded_server import LARGEST_MESSAGE, MOST_CONNECTIONS, start_server
+from tracking3d.ui.web.access import Access
 
 OURS = [f"viser-v{viser.__version__}"]
 

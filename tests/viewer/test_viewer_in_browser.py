@@ -9,8 +9,8 @@ from turning_sphere import turning_sphere_of, written_run
 
 pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[view]'")
 
-from tracking3d.viewer.opening import open_viewer
-from tracking3d.web.access import Access
+from tracking3d.ui.viewer.opening import open_viewer
+from tracking3d.ui.web.access import Access
 
 pytestmark = pytest.mark.slow  # without a graphics card the browser draws the model on the processor
 

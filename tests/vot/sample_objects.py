@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tracking3d.results.files import write_image
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 QUICK = "crop.size=32 object.frequency=2 object.texture_size=16"
 

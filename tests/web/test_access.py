@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.web.access import Access
+from tracking3d.ui.web.access import Access
 
 PORT = 8080
 OURS = {"path": "/", "host": "127.0.0.1:8080", "origin": None, "cookie": None}

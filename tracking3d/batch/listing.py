@@ -33,7 +33,7 @@ from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.pipeline.validation import needs_prompt
-from tracking3d.prompts.boxes import BoxFormat
+from tracking3d.trackers.prompts.boxes import BoxFormat
 
 Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""

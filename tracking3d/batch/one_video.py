@@ -21,14 +21,14 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.prompts.boxes import parse_box
-from tracking3d.prompts.corrections import parse_correction
-from tracking3d.prompts.points import parse_points
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import FrameRecord
 from tracking3d.runtime.progress import ProgressListener, StageProgress, listen_to_progress
+from tracking3d.trackers.prompts.boxes import parse_box
+from tracking3d.trackers.prompts.corrections import parse_correction
+from tracking3d.trackers.prompts.points import parse_points
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
@@ -138,7 +138,7 @@ def put_away(
         OutputError: If something cannot be written.
     """
     if report:
-        from tracking3d.report.several import write_reports
+        from tracking3d.ui.report.several import write_reports
 
         write_reports(runs)
     marker = write_marker(work / RUN, job, attempts, runs, note)

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, ValidationError
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.prompts.boxes import BoxFormat
+from tracking3d.trackers.prompts.boxes import BoxFormat
 
 SEPARATOR = ";"
 """Between several values in one cell."""

@@ -19,10 +19,10 @@ from tracking3d.batch.video_job import VideoJob, share_networks
 from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
 from tracking3d.errors import OutputError
-from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
 from tracking3d.results.files import try_lock, writing
 from tracking3d.results.layout import refuse_root
+from tracking3d.ui.report.rendering import render_page
 
 _log = logging.getLogger(__name__)
 

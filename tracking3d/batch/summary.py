@@ -86,8 +86,8 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
 
 def thumbnail(run: RunReader) -> str:
     """The overlay of the frame in the middle, as a small JPEG in base64; empty if there is none."""
-    from tracking3d.report.frame_pictures import jpeg_of
     from tracking3d.results.redrawing import overlay_frames
+    from tracking3d.ui.report.frame_pictures import jpeg_of
 
     rows = OverlaySize.of(run.camera).picture
     for image in overlay_frames(run, [len(run.frames) // 2]):

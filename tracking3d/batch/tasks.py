@@ -21,12 +21,12 @@ from tracking3d.batch.one_video import (
 )
 from tracking3d.batch.video_job import SharedNetwork, VideoJob
 from tracking3d.engines.protocol import Ended, Task, Tell
-from tracking3d.prompts.boxes import parse_box
-from tracking3d.prompts.points import parse_points
-from tracking3d.prompts.prompt import PromptSet
-from tracking3d.submaps.job import LongVideo, SplitResult
-from tracking3d.submaps.plan import Begun, begin
-from tracking3d.submaps.split_run import Step, Steps, steps_of
+from tracking3d.pipeline.submaps.job import LongVideo, SplitResult
+from tracking3d.pipeline.submaps.plan import Begun, begin
+from tracking3d.pipeline.submaps.split_run import Step, Steps, steps_of
+from tracking3d.trackers.prompts.boxes import parse_box
+from tracking3d.trackers.prompts.points import parse_points
+from tracking3d.trackers.prompts.prompt import PromptSet
 
 
 @dataclass

@@ -11,11 +11,11 @@ from typing import Any
 
 from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.engines.protocol import Engine, Shared
-from tracking3d.networks.catalogue import known_networks
-from tracking3d.networks.store import find_known, network_path
+from tracking3d.features.networks.catalogue import known_networks
+from tracking3d.features.networks.store import find_known, network_path
 from tracking3d.pipeline.tracker_selection import CANDIDATES
-from tracking3d.prompts.boxes import BoxFormat
 from tracking3d.results.files import write_atomic, writing
+from tracking3d.trackers.prompts.boxes import BoxFormat
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class VideoJob:
     sequence: tuple[str, str, str] | None = None
     size: int = 0  # bytes of the video, if known: large ones are begun first
     fault: str = ""  # why it cannot be done, if known beforehand
-    # length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none
+    # length of the parts that it is cut into, see `tracking3d.pipeline.submaps.cuts.parse_length`; empty for none
     split: str = ""
     box_format: BoxFormat = "xywh"  # how boxes are written, in corrections too
 

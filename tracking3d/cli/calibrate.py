@@ -14,7 +14,7 @@ from tracking3d.cli.options.general import VIDEO
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from tracking3d.calibration.calibrate import Board, Calibration
+    from tracking3d.geometry.calibration.calibrate import Board, Calibration
 
 MOST_FRAMES = 150
 """Frames of a video in which the board is detected, spread evenly over it."""
@@ -122,8 +122,8 @@ def video(
 
     The file is OpenCV's YAML, with intrinsics, distortion, image size, reprojection error and coverage.
     """
-    from tracking3d.calibration.calibrate import calibrate
-    from tracking3d.calibration.camera_files import write_camera
+    from tracking3d.geometry.calibration.calibrate import calibrate
+    from tracking3d.geometry.calibration.camera_files import write_camera
     from tracking3d.video import open_source
 
     if model not in ("radtan", "fisheye"):
@@ -153,7 +153,7 @@ def video(
 
 
 def _board(kind: str, squares: str, square: float) -> Board:
-    from tracking3d.calibration.calibrate import Board, parse_squares
+    from tracking3d.geometry.calibration.calibrate import Board, parse_squares
 
     if kind not in ("charuco", "chessboard"):
         raise InputError(f"--board {kind} is unknown; give charuco or chessboard.")

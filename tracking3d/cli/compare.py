@@ -11,7 +11,7 @@ from tracking3d.cli.options import AsJson, Debug, Quiet
 from tracking3d.cli.options.general import OUTPUT
 
 if TYPE_CHECKING:
-    from tracking3d.report.differences import RunComparison
+    from tracking3d.ui.report.differences import RunComparison
 
 
 def compare(
@@ -46,9 +46,9 @@ def compare(
         check_run_folder(folder)
     from tracking3d.cli.progress import load_with_progress, show_progress
 
-    load_with_progress("tracking3d.report.comparison", quiet)
-    from tracking3d.report.comparison import write_comparison
-    from tracking3d.report.differences import compare_runs
+    load_with_progress("tracking3d.ui.report.comparison", quiet)
+    from tracking3d.ui.report.comparison import write_comparison
+    from tracking3d.ui.report.differences import compare_runs
 
     with show_progress(quiet):
         comparison = compare_runs(runs, against)
@@ -69,8 +69,8 @@ def _print(comparison: RunComparison) -> None:
     from rich.table import Table
 
     from tracking3d.cli.tables import format_value, print_table
-    from tracking3d.report.differences import run_figures
     from tracking3d.runtime.stage_times import STAGES
+    from tracking3d.ui.report.differences import run_figures
 
     names = [escape(name) for name in comparison.names]
 

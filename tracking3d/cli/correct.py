@@ -34,8 +34,8 @@ def correct(
     """
     import logging
 
-    from tracking3d.prompts.boxes import check_box_format
-    from tracking3d.prompts.corrections import parse_correction
+    from tracking3d.trackers.prompts.boxes import check_box_format
+    from tracking3d.trackers.prompts.corrections import parse_correction
 
     written = check_box_format(box_format or "xywh")
     parsed = [parse_correction(text, written) for text in corrections]

@@ -36,10 +36,10 @@ def demo(
     load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import RecordOptions, record_tracking
-    from tracking3d.prompts.prompt import PromptSet
     from tracking3d.results.files import write_atomic
     from tracking3d.results.layout import REPORT
-    from tracking3d.synthesis.convex_clips import make_demo_clip
+    from tracking3d.testing.synthesis.convex_clips import make_demo_clip
+    from tracking3d.trackers.prompts.prompt import PromptSet
     from tracking3d.video import open_source
 
     settings = configure(None, None, None, tracker="csrt", features="rgb", runtime={"seed": seed})

@@ -68,12 +68,12 @@ def model(
     from tracking3d.cli.progress import load_with_progress, show_progress
 
     load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
-    from tracking3d.checkpoint.staging import take_over
+    from tracking3d.results.checkpoint.staging import take_over
 
     take_over(run)
     from tracking3d.reconstruction.final_shape import texture_limits
-    from tracking3d.report.several import renew_report
     from tracking3d.results.run_reader import RunReader
+    from tracking3d.ui.report.several import renew_report
 
     config = _settings_of_run(RunReader(run))
     if extend is None and model == "auto" and config.object.extends is not None:

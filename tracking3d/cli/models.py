@@ -13,7 +13,7 @@ from tracking3d.cli.options import AsJson, Debug, Quiet
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
-    from tracking3d.networks.catalogue import KnownNetwork
+    from tracking3d.features.networks.catalogue import KnownNetwork
 
 app = typer.Typer(
     help="List known neural networks, download them into your cache, and verify them.", no_args_is_help=True
@@ -28,8 +28,8 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
     """List the known networks: purpose, size, licence, and whether they are in your cache."""
     import json
 
-    from tracking3d.networks.catalogue import known_networks
-    from tracking3d.networks.store import State, network_path, state_of
+    from tracking3d.features.networks.catalogue import known_networks
+    from tracking3d.features.networks.store import State, network_path, state_of
 
     networks = list(known_networks().values())
     there = {network.name: state_of(network, check=False) is not State.ABSENT for network in networks}
@@ -93,9 +93,9 @@ def get(
 
     A stopped download continues where it stopped. Proxies are read from https_proxy and http_proxy.
     """
-    from tracking3d.networks.catalogue import known_networks, recommended_networks
-    from tracking3d.networks.download import adopt, fetch
-    from tracking3d.networks.store import State, find_known, network_path, state_of
+    from tracking3d.features.networks.catalogue import known_networks, recommended_networks
+    from tracking3d.features.networks.download import adopt, fetch
+    from tracking3d.features.networks.store import State, find_known, network_path, state_of
 
     several = names is not None and _RECOMMENDED in names
     if bool(names) == everything or (file is not None and (several or len(names or ()) != 1)):
@@ -139,8 +139,8 @@ def verify(
     """Compare the SHA-256 of the networks in your cache with the known one."""
     import json
 
-    from tracking3d.networks.catalogue import known_networks
-    from tracking3d.networks.store import State, cache_folder, find_known, find_network, state_of
+    from tracking3d.features.networks.catalogue import known_networks
+    from tracking3d.features.networks.store import State, cache_folder, find_known, find_network, state_of
 
     if name is not None:
         find_network(find_known(name).name)

@@ -19,9 +19,9 @@ from tracking3d.cli.view import show_address
 if TYPE_CHECKING:
     from tracking3d.cli.tracking import RunDisplay, RunRequest
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.picker.server import Picker
-    from tracking3d.picker.session import ChosenSettings, Picked, SettingsMenu
-    from tracking3d.prompts.prompt import PromptSet
+    from tracking3d.trackers.prompts.prompt import PromptSet
+    from tracking3d.ui.picker.server import Picker
+    from tracking3d.ui.picker.session import ChosenSettings, Picked, SettingsMenu
 
 
 @grouped
@@ -73,11 +73,11 @@ def pick(
         config = menu.configure(menu.chosen)
     load_with_progress("tracking3d.pipeline.record", quiet)
     if view:
-        from tracking3d.viewer.opening import check_viser
+        from tracking3d.ui.viewer.opening import check_viser
 
         check_viser("--view")
     from tracking3d.pipeline.record import RecordOptions
-    from tracking3d.prompts.prompt import PromptSet
+    from tracking3d.trackers.prompts.prompt import PromptSet
 
     options = RecordOptions(None, frames, overwrite)
     request = RunRequest(source, config, out or default_folder(source), PromptSet(), options)
@@ -97,7 +97,7 @@ def track_picked(
         start: What tracks.
     """
     from tracking3d.cli.progress import load_with_progress
-    from tracking3d.picker.correction import command_of
+    from tracking3d.ui.picker.correction import command_of
 
     resume = page.picked is not None
     picked, options = page.wait(), request.options
@@ -144,7 +144,7 @@ def settings_menu(
         settings: The same; quality and final mesh.
         configure: Makes the configuration from such options.
     """
-    from tracking3d.picker.session import ChosenSettings, SettingsMenu
+    from tracking3d.ui.picker.session import ChosenSettings, SettingsMenu
 
     lens = camera.settings()
     at_first = ChosenSettings(
@@ -185,7 +185,7 @@ def _with_named_tracker(config: PipelineConfig, source: str, frames: str | None)
 
 def prompts_of(picked: Picked) -> PromptSet:
     """The prompts that were marked in the browser."""
-    from tracking3d.prompts.prompt import PromptSet
+    from tracking3d.trackers.prompts.prompt import PromptSet
 
     several = len(picked.boxes) + len(picked.masks) > 1
     return PromptSet(picked.boxes, picked.masks, start_frame=picked.frame, as_lists=several)
@@ -212,15 +212,15 @@ def open_picker(
         OutputError: There is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
-    from tracking3d.picker.correction import command_of, read_outcome, save_outcome, settings_as_yaml
-    from tracking3d.picker.server import Picker
-    from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
     from tracking3d.results.overwrite import check_output_folder
+    from tracking3d.ui.picker.correction import command_of, read_outcome, save_outcome, settings_as_yaml
+    from tracking3d.ui.picker.server import Picker
+    from tracking3d.ui.picker.session import PickingSession
+    from tracking3d.ui.web.access import Access
     from tracking3d.video import open_source, parse_selection
     from tracking3d.video.any_frame import frame_images
     from tracking3d.video.source import within
-    from tracking3d.web.access import Access
 
     source, folder, options = request.source, request.folder, request.options
     frames, overwrite = options.selection, options.overwrite

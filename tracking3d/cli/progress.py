@@ -27,8 +27,8 @@ from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.picker.server import PageProgress
     from tracking3d.results.records import FrameRecord
+    from tracking3d.ui.picker.server import PageProgress
 
 _EVERY = 10.0
 """Seconds between lines of a log."""
@@ -65,7 +65,7 @@ class ProgressDisplay:
 
     def progress(self) -> PageProgress:
         """The same for a page."""
-        from tracking3d.picker.server import PageProgress
+        from tracking3d.ui.picker.server import PageProgress
 
         now = time.monotonic()
         sentence = f"{self._stage}, {self._time(now)}"

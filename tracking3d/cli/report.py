@@ -33,9 +33,9 @@ def report(
         check_run_folder(folder)
     from tracking3d.cli.progress import load_with_progress, plan_report, show_progress
 
-    load_with_progress("tracking3d.report.several", quiet, kernels=True)
-    from tracking3d.report.several import write_reports
+    load_with_progress("tracking3d.ui.report.several", quiet, kernels=True)
     from tracking3d.results.run_reader import RunReader
+    from tracking3d.ui.report.several import write_reports
 
     folders = runs_in(run)
     with show_progress(quiet) as display:
@@ -96,8 +96,8 @@ def _is_due(folder: Path, before: tuple[int, ...]) -> bool:
 
 def _write(folders: Sequence[Path]) -> None:
     try:
-        from tracking3d.report.several import write_reports
         from tracking3d.results.layout import RUN
+        from tracking3d.ui.report.several import write_reports
 
         write_reports([folder for folder in folders if (folder / RUN).is_file()])
     except Exception as error:

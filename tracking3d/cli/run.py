@@ -27,10 +27,10 @@ from tracking3d.runtime.memory import collection_deferred
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.frames import Box
-    from tracking3d.prompts.boxes import BoxFormat
-    from tracking3d.prompts.corrections import Correction
-    from tracking3d.prompts.prompt import PromptSet
-    from tracking3d.submaps.job import SplitResult
+    from tracking3d.pipeline.submaps.job import SplitResult
+    from tracking3d.trackers.prompts.boxes import BoxFormat
+    from tracking3d.trackers.prompts.corrections import Correction
+    from tracking3d.trackers.prompts.prompt import PromptSet
 
 
 @grouped
@@ -165,9 +165,9 @@ def _configure_in_browser(
 
 def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
-    from tracking3d.prompts.boxes import check_box_format
-    from tracking3d.prompts.points import parse_points
-    from tracking3d.prompts.prompt import PromptSet
+    from tracking3d.trackers.prompts.boxes import check_box_format
+    from tracking3d.trackers.prompts.points import parse_points
+    from tracking3d.trackers.prompts.prompt import PromptSet
     from tracking3d.video.source import parse_selection
 
     start = prompt.start_frame
@@ -181,8 +181,8 @@ def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
 
 
 def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
-    from tracking3d.prompts.boxes import check_box_format
-    from tracking3d.prompts.corrections import parse_correction, validate_corrections
+    from tracking3d.trackers.prompts.boxes import check_box_format
+    from tracking3d.trackers.prompts.corrections import parse_correction, validate_corrections
 
     box_format = check_box_format(prompt.box_format)
     corrections = [parse_correction(text, box_format) for text in prompt.correct or ()]
@@ -211,7 +211,7 @@ def track_in_parts(request: RunRequest, display: RunDisplay, length: str, worker
     """
     from tracking3d.cli.progress import plan_run, show_progress
     from tracking3d.cli.report import report_at_end
-    from tracking3d.submaps.split_run import record_in_parts
+    from tracking3d.pipeline.submaps.split_run import record_in_parts
     from tracking3d.video import open_source
 
     _check(request, workers, display)
@@ -286,7 +286,7 @@ def _processors() -> int:
 @contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
     """If the run is stopped, say how to continue it."""
-    from tracking3d.submaps.plan import PARTS
+    from tracking3d.pipeline.submaps.plan import PARTS
 
     try:
         yield
@@ -312,7 +312,7 @@ def parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Bo
     Raises:
         InputError: The text is neither.
     """
-    from tracking3d.prompts.boxes import parse_box
+    from tracking3d.trackers.prompts.boxes import parse_box
 
     if Path(text).is_file():
         from tracking3d.trackers.vot_regions import box_in_file

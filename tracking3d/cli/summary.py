@@ -65,8 +65,8 @@ def print_summary(folder: Path) -> None:
 
 def advise_networks(tracker: str) -> str:
     """What the recommended networks would bring to a run without networks; empty if they are there, or not needed."""
-    from tracking3d.networks.catalogue import recommended_networks
-    from tracking3d.networks.store import State, state_of
+    from tracking3d.features.networks.catalogue import recommended_networks
+    from tracking3d.features.networks.store import State, state_of
 
     networks = recommended_networks()
     if tracker not in _WITHOUT_NETWORKS or all(

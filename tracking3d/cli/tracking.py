@@ -17,10 +17,10 @@ import typer
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.picker.server import PageProgress, Picker
     from tracking3d.pipeline.record import RecordOptions
-    from tracking3d.prompts.corrections import Correction
-    from tracking3d.prompts.prompt import PromptSet
+    from tracking3d.trackers.prompts.corrections import Correction
+    from tracking3d.trackers.prompts.prompt import PromptSet
+    from tracking3d.ui.picker.server import PageProgress, Picker
 
 
 @dataclass(frozen=True)
@@ -94,14 +94,14 @@ def _shown_on_page(
     display: RunDisplay, folder: Path, folders: Sequence[Path], progress: Callable[[], PageProgress]
 ) -> Iterator[None]:
     """Within, the page shows how far the run is, and afterwards that it is finished."""
-    from tracking3d.picker.server import PageProgress, ShownRun
+    from tracking3d.ui.picker.server import PageProgress, ShownRun
 
     page = display.page
     assert page is not None
 
     @cache
     def view() -> str:
-        from tracking3d.viewer.opening import open_viewer
+        from tracking3d.ui.viewer.opening import open_viewer
 
         viewer = open_viewer([folder], page.access)
         page.ends.callback(viewer.close)

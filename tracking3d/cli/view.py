@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
     from tracking3d.pipeline.record import Listener
     from tracking3d.results.records import FrameRecord
+    from tracking3d.ui.viewer.viewer import Viewer
     from tracking3d.video.any_frame import FrameImages
     from tracking3d.video.source import FrameSource
-    from tracking3d.viewer.viewer import Viewer
 
 
 def view(
@@ -50,10 +50,10 @@ def view(
     The page follows a run that is still running. Several runs are shown side by side.
     """
     from tracking3d.cli.progress import show_progress
-    from tracking3d.viewer.opening import check_viser, open_viewer
+    from tracking3d.ui.viewer.opening import check_viser, open_viewer
 
     check_viser("`tracking3d view`")
-    from tracking3d.web.access import Access
+    from tracking3d.ui.web.access import Access
 
     with show_progress(quiet):
         report_progress("opening the viewer")
@@ -85,10 +85,10 @@ def watch(
         PluginError: viser is not installed.
     """
     from tracking3d.errors import InputError
+    from tracking3d.ui.viewer.opening import check_viser, open_viewer
+    from tracking3d.ui.viewer.run_images import LatestImages
+    from tracking3d.ui.web.access import Access
     from tracking3d.video.any_frame import frame_images
-    from tracking3d.viewer.opening import check_viser, open_viewer
-    from tracking3d.viewer.run_images import LatestImages
-    from tracking3d.web.access import Access
 
     check_viser("--view")
     opened: list[Viewer] = []

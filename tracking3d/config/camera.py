@@ -7,10 +7,10 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from tracking3d.calibration.camera_files import CalibratedCamera, as_coefficients, read_camera
 from tracking3d.config.explain import a_kind
 from tracking3d.config.models import LARGEST_OBJECT, CameraConfig, PipelineConfig
 from tracking3d.errors import InputError, argument
+from tracking3d.geometry.calibration.camera_files import CalibratedCamera, as_coefficients, read_camera
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, DEFAULT_ORIGIN, Camera
 from tracking3d.geometry.lens import Lens
 

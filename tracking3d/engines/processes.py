@@ -29,7 +29,7 @@ GRACE = 20.0
 
 PRELOADED = [
     "tracking3d.pipeline.record",
-    "tracking3d.report.several",
+    "tracking3d.ui.report.several",
     "tracking3d.rendering.kernels.compilation",
     "tracking3d.trackers.csrt",
     "tracking3d.trackers.flow",

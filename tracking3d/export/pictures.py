@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 
-from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, SkippedFrame, pixels
+from tracking3d.results.checkpoint.progress import checksum
 from tracking3d.results.run_reader import RunReader, places_of
 from tracking3d.video import open_source
 

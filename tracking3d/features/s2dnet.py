@@ -34,7 +34,7 @@ class S2DNetEncoder:
         threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
 
     def __init__(self, threads: int = 1) -> None:
-        from tracking3d.networks.session import Network
+        from tracking3d.features.networks.session import Network
 
         with resources.as_file(resources.files("tracking3d.features") / "weights" / "s2dnet.onnx") as file:
             self._network = Network(Path(file), threads)

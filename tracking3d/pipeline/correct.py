@@ -9,20 +9,20 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.checkpoint.staging import keeps_shape, prompt_record_in, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.open_tracking import request_tracking
 from tracking3d.pipeline.record import RecordOptions, record_tracking
-from tracking3d.prompts.corrections import Correction, missing_frame_error, validate_corrections
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.reconstruction.rebuild import check_packages
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.staging import keeps_shape, prompt_record_in, take_over
 from tracking3d.results.files import read_given_mask
 from tracking3d.results.layout import runs_in
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, open_run_source
+from tracking3d.trackers.prompts.corrections import Correction, missing_frame_error, validate_corrections
+from tracking3d.trackers.prompts.prompt import PromptSet
 
 
 def correct_run(

@@ -9,8 +9,6 @@ from typing import Any
 
 import cv2
 
-from tracking3d.checkpoint.progress import check_picture
-from tracking3d.checkpoint.run_state import RunState
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.pipeline.frame_reading import SavedMasks
@@ -25,6 +23,8 @@ from tracking3d.pipeline.refinement_steps import (
 from tracking3d.reconstruction import keep_best_views, texture_view
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, HeldAdjustment
 from tracking3d.rendering.backend import share_threads
+from tracking3d.results.checkpoint.progress import check_picture
+from tracking3d.results.checkpoint.run_state import RunState
 from tracking3d.results.files import decode_mask
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter

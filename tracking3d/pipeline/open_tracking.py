@@ -23,10 +23,15 @@ from tracking3d.pipeline.validation import (
     needs_prompt,
     validate_config,
 )
-from tracking3d.prompts.corrections import Correction, check_corrections_fit, prompts_in, validate_corrections
-from tracking3d.prompts.prompt import PromptSet, damaged_start_error
 from tracking3d.results.layout import RUN
 from tracking3d.results.run_reader import RunReader
+from tracking3d.trackers.prompts.corrections import (
+    Correction,
+    check_corrections_fit,
+    prompts_in,
+    validate_corrections,
+)
+from tracking3d.trackers.prompts.prompt import PromptSet, damaged_start_error
 from tracking3d.video.both_ways import check_start_frame
 from tracking3d.video.source import FrameSource, is_live, known_indices
 

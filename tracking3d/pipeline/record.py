@@ -12,12 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.checkpoint.folder import Checkpoint, finish_state
-from tracking3d.checkpoint.integrity import RunIntegrity
-from tracking3d.checkpoint.progress import SavedState
-from tracking3d.checkpoint.resuming import Earlier, earlier_run, prompt_record
-from tracking3d.checkpoint.run_state import RunState
-from tracking3d.checkpoint.staging import keeps_shape, read_intact_state, stage_correction, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
@@ -28,10 +22,14 @@ from tracking3d.pipeline.passes import Listener, run_passes
 from tracking3d.pipeline.recorder import ObjectRecorder
 from tracking3d.pipeline.session import Session
 from tracking3d.pipeline.validation import validate_folder
-from tracking3d.prompts.corrections import Correction
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.reconstruction.final_shape import is_reconstructed, make_final_shape
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.folder import Checkpoint, finish_state
+from tracking3d.results.checkpoint.integrity import RunIntegrity
+from tracking3d.results.checkpoint.progress import SavedState
+from tracking3d.results.checkpoint.resuming import Earlier, earlier_run, prompt_record
+from tracking3d.results.checkpoint.run_state import RunState
+from tracking3d.results.checkpoint.staging import keeps_shape, read_intact_state, stage_correction, take_over
 from tracking3d.results.description import RunHeader
 from tracking3d.results.files import keep_given_masks
 from tracking3d.results.layout import object_folders
@@ -41,6 +39,8 @@ from tracking3d.results.redrawing import redraw_contact_sheet, redraw_overlay
 from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import PICTURES, RunWriter, WrittenSoFar, missing_files
+from tracking3d.trackers.prompts.corrections import Correction
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video.source import FrameSource, source_notes
 
 __all__ = ["Listener", "RecordOptions", "record", "record_objects", "record_tracking"]

@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tracking3d.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
-from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
@@ -24,15 +22,17 @@ from tracking3d.pipeline.refinement_steps import (
     find_earlier_refinement,
 )
 from tracking3d.pipeline.session import Session
-from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture, close_unseen
 from tracking3d.reconstruction.final_shape import is_reconstructed
+from tracking3d.results.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
+from tracking3d.results.checkpoint.run_state import RunState
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter, is_initial_mask
 from tracking3d.runtime.concurrency import BackgroundWriter
 from tracking3d.runtime.progress import report_progress
+from tracking3d.trackers.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)

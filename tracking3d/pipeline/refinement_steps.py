@@ -9,7 +9,7 @@ The steps are the same for any range of frames::
     settle_masks()                                     # what they have in common
     for frame in frames: decide(frame); rest()         # the mask of every frame
 
-A run in one process takes all frames through one `RefinementSteps`. `tracking3d.submaps.merge_step` takes
+A run in one process takes all frames through one `RefinementSteps`. `tracking3d.pipeline.submaps.merge_step` takes
 ranges of frames through several, in processes of their own: what is adjusted together, and the masks that are
 collected, are done once.
 """
@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.segmentation.temporal_neighbours import REACH
+from tracking3d.estimation.segmentation.whole_video import SegmentedMask, VideoSegmenter, draw_around_masks
 from tracking3d.estimation.solver import LEAST_FRAMES, RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
@@ -43,8 +45,6 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import load_own_model, read_own_records
 from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.scene.view import ObjectView
-from tracking3d.segmentation.temporal_neighbours import REACH
-from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter, draw_around_masks
 
 Decision = tuple[Frame, SegmentedMask | None]
 """A frame that is due, and its mask; None if its present mask stays."""

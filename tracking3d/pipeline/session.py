@@ -42,9 +42,9 @@ from tracking3d.pipeline.session_refinement import SessionRefinement
 from tracking3d.pipeline.tracker_selection import choose_tracker
 from tracking3d.pipeline.validation import check_frame, check_session
 from tracking3d.plugins.guard import PluginFailure
-from tracking3d.prompts.prompt import check_prompt_fits
 from tracking3d.runtime.isolation import IsolatedRuntime, RandomState
 from tracking3d.runtime.stage_times import StageTimes, measure
+from tracking3d.trackers.prompts.prompt import check_prompt_fits
 
 
 class Session(SessionRefinement):

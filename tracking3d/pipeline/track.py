@@ -27,9 +27,9 @@ from tracking3d.pipeline.point_queries import validate_queries
 from tracking3d.pipeline.session import Session
 from tracking3d.pipeline.tracking import Tracking, track_frames
 from tracking3d.pipeline.validation import set_known_object, validate_config
-from tracking3d.prompts.corrections import Correction
-from tracking3d.prompts.prompt import PromptSet
 from tracking3d.reconstruction.rebuild import check_packages
+from tracking3d.trackers.prompts.corrections import Correction
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video.in_memory import open_frames, validate_image
 from tracking3d.video.source import FrameSource
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
-from tracking3d.networks.catalogue import known_networks
-from tracking3d.networks.store import State, state_of
+from tracking3d.features.networks.catalogue import known_networks
+from tracking3d.features.networks.store import State, state_of
 from tracking3d.plugins import TRACKERS, check_options
 
 AFFORDABLE = 900.0

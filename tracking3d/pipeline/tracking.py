@@ -22,9 +22,9 @@ from tracking3d.pipeline.passes import ActiveRecordings, run_refinement
 from tracking3d.pipeline.point_queries import PointFollowing
 from tracking3d.pipeline.record import RecordOptions, begin_recording
 from tracking3d.pipeline.result import TemporaryRun, TrackingResult
-from tracking3d.prompts.corrections import UnmetCorrections
 from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.run_unit import apply_object_size
+from tracking3d.trackers.prompts.corrections import UnmetCorrections
 
 _T = TypeVar("_T")
 

@@ -11,7 +11,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, Prompt
-from tracking3d.prompts.prompt import validate_box, validate_mask
+from tracking3d.trackers.prompts.prompt import validate_box, validate_mask
 from tracking3d.video.source import FrameSource
 
 
@@ -56,7 +56,7 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(
-                f"prompt= is {a_kind(prompt)}; make one with tracking3d.prompts.prompt.make_prompt."
+                f"prompt= is {a_kind(prompt)}; make one with tracking3d.trackers.prompts.prompt.make_prompt."
             )
         validate_box(prompt.box, "prompt.box=")
         if prompt.mask is not None:

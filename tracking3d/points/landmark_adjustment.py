@@ -18,8 +18,8 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import Reversal
 from tracking3d.geometry.camera import Camera
+from tracking3d.points.bundle_adjustment.adjustment import Reversal
 from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.robust_bundle import bundle, other_way_round

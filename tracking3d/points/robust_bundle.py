@@ -14,9 +14,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment import Structure, Tracks, adjust
-from tracking3d.bundle_adjustment.adjustment import Reversal, reversal_of
 from tracking3d.geometry.camera import LENS_KNOWN
+from tracking3d.points.bundle_adjustment import Structure, Tracks, adjust
+from tracking3d.points.bundle_adjustment.adjustment import Reversal, reversal_of
 from tracking3d.scene.view import Array
 
 TURNS = 12

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.estimation.online.features.sift import Keypoints, detect
@@ -21,6 +20,7 @@ from tracking3d.reconstruction.shape import MOST
 from tracking3d.reconstruction.views import keep_best_views, shape_view, spread_by_rotation, texture_view
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
+from tracking3d.results.checkpoint.progress import checksum
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each

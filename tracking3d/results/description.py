@@ -41,7 +41,7 @@ class RunHeader:
     source_notes: Sequence[str] = ()  # how the source processed its images, in clauses
     selection: str | None = None  # the START:STOP:STEP that the source was opened with
     renderer: Mapping[str, str | int] | None = None  # what renders, and why
-    # the identity of source and prompt, see `tracking3d.checkpoint.resuming.prompt_record`
+    # the identity of source and prompt, see `tracking3d.results.checkpoint.resuming.prompt_record`
     given: Mapping[str, Any] | None = None
     tracker_choice: str | None = None  # why auto chose the mask tracker of config; None if the user named it
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import OCCLUDER, Prompt
-from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.layout import OUT, partial_path
+from tracking3d.trackers.prompts.corrections import Correction
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}

@@ -17,11 +17,29 @@ from typing import Any
 _ROOMS = {"benchmark", "datasets", "evaluation", "speed", "synthesis", "vot"}
 """Of the package, whose modules are in ``tracking3d_bench`` now."""
 
+_MOVED_ROOMS = {
+    "bundle_adjustment": "points.bundle_adjustment",
+    "calibration": "geometry.calibration",
+    "checkpoint": "results.checkpoint",
+    "networks": "features.networks",
+    "picker": "ui.picker",
+    "prompts": "trackers.prompts",
+    "report": "ui.report",
+    "segmentation": "estimation.segmentation",
+    "submaps": "pipeline.submaps",
+    "viewer": "ui.viewer",
+    "web": "ui.web",
+}
+"""Former rooms of the package, and where they are in it now."""
+
 _ELSEWHERE = {
     "tracking3d.config.solvers": "tracking3d.config.models",
     "tracking3d.datasets.region_files": "tracking3d.trackers.region_files",
     "tracking3d.datasets.region_tracker": "tracking3d.trackers.region_tracker",
     "tracking3d.speed.kernels_ahead": "tracking3d.runtime.kernels_ahead",
+} | {
+    f"tracking3d.synthesis.{name}": f"tracking3d.testing.synthesis.{name}"
+    for name in ("convex_clips", "convex_raycast", "procedural_texture")
 }
 
 
@@ -44,12 +62,13 @@ class MovedModules:
     ) -> ModuleSpec | None:
         """Where a former name leads; None for every other name."""
         package, _, inside = fullname.partition(".")
-        room = inside.partition(".")[0]
-        if package != "tracking3d" or (room not in _ROOMS and fullname not in _ELSEWHERE):
+        room, _, rest = inside.partition(".")
+        if package != "tracking3d" or not (room in _ROOMS | _MOVED_ROOMS.keys() or fullname in _ELSEWHERE):
             return None
         if inside == room and room != "vot":
             return ModuleSpec(fullname, _FormerRoom(), is_package=True)  # type: ignore[arg-type]
-        present = _ELSEWHERE.get(fullname, f"tracking3d_bench.{inside}")
+        within = room in _MOVED_ROOMS and f"tracking3d.{_MOVED_ROOMS[room]}.{rest}"
+        present = _ELSEWHERE.get(fullname) or within or f"tracking3d_bench.{inside}"
         # Trackers of the VOT toolkit are named in its users' files, who see no DeprecationWarning.
         kind = FutureWarning if room == "vot" else DeprecationWarning
         warnings.warn(f"{fullname} has moved: use {present}.", kind, stacklevel=2)

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from network import CHANNELS, MULTIPLE, STRIDE, DenseFeatures
-from tracking3d.networks.session import Network
+from tracking3d.features.networks.session import Network
 
 
 def export(checkpoint: Path, file: Path) -> None:

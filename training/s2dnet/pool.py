@@ -15,7 +15,7 @@ from pairs import CANVAS, Pair, make_canvas, warped_pair
 from photographs import find_cutouts, find_photographs
 from recipe import Recipe
 from rendered import RenderedObject, render_objects, rendered_pair
-from tracking3d.networks.session import Network
+from tracking3d.features.networks.session import Network
 
 _TRIES = 4  # points are drawn with a preference for texture: the best of so many
 

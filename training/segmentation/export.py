@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from network import CHANNELS, MULTIPLE, OUTPUTS, SIZE, SegmentationNetwork, fold_batch_norms
-from tracking3d.networks.session import Network
+from tracking3d.features.networks.session import Network
 
 _MAX_DIFFERENCE = 0.05
 """Of a logit, by the rounding of the weights."""

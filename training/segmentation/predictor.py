@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from batches import CROP
 from channels import CUE_LIMIT, LOG_LIMIT
 from network import CHANNELS, SIZE
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
-from tracking3d.networks.session import Network
 from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.colour_models import GlobalColours
 from tracking3d.trackers.crops import box_of, clip_box

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from tracking3d_aliked import AlikedEncoder
 
 from tracking3d.errors import InputError
-from tracking3d.networks.session import Network
+from tracking3d.features.networks.session import Network
 from tracking3d.testing import check_encoder
 
 EXPORT = Path(__file__).resolve().parents[4] / "shared" / "models" / "aliked-n16_dense.onnx"

@@ -32,9 +32,9 @@ from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.protocol import Needs
 from tracking3d.pipeline.record import record
 from tracking3d.plugins import VARIABLE
-from tracking3d.prompts.prompt import parse_box
 from tracking3d.results.run_reader import RunReader
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.trackers.prompts.prompt import parse_box
 from tracking3d.video import VideoWriter, open_source
 
 DISTINCT = 20

@@ -22,7 +22,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.record import record
 from tracking3d.results.records import FrameRecord
 from tracking3d.runtime.memory import resident_memory
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video.source import Intrinsics
 
 SETTLED = 500

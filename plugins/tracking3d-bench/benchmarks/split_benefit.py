@@ -18,12 +18,12 @@ from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.pipeline.record import record
-from tracking3d.prompts.prompt import PromptSet
+from tracking3d.pipeline.submaps.split_run import record_in_parts
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask, writing
 from tracking3d.results.run_reader import RunReader, is_finished
-from tracking3d.submaps.split_run import record_in_parts
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
+from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 

@@ -11,8 +11,8 @@ from small_d3s import write_small_d3s
 from tracking3d_d3s import D3sTracker
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.networks.session import Network
 from tracking3d.testing import check_tracker
 from tracking3d.trackers.protocol import MaskTracker
 from tracking3d.trackers.segmentation import ColourSegmentation

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Window
-from tracking3d.networks.session import Network
 from tracking3d.scene.view import crop_window, inside_frame
 from tracking3d.trackers.crops import box_iou, box_of, clip_box, paste_mask
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker

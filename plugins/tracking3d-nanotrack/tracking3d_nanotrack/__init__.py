@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.features.networks.store import find_network
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.networks.store import find_network
 from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.onnx.boxes import NetworkBoxes, nano_boxes
 from tracking3d.trackers.protocol import Options

@@ -14,8 +14,8 @@ from tracking3d_ostrack.patches import Patch
 from tracking3d_ostrack.refinement import AlphaRefine
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.networks.session import Network
 from tracking3d.testing import check_tracker
 from tracking3d.trackers.protocol import MaskTracker
 from tracking3d.trackers.vot_regions import encode_mask, format_region

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
+from tracking3d.features.networks.store import find_network
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.networks.session import Network
-from tracking3d.networks.store import find_network
 from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker, Options
 from tracking3d_ostrack.network import OsTrackBoxes
 from tracking3d_ostrack.refinement import AlphaRefine

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
-from tracking3d.networks.session import Network
 from tracking3d_ostrack.patches import Patch
 
 _TEMPLATE, _SEARCH = 2.0, 4.0  # sides of the crops over the square root of the box's area

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tracking3d.errors import InputError
-from tracking3d.prompts.prompt import parse_box
+from tracking3d.trackers.prompts.prompt import parse_box
 from tracking3d_ros2.tracking import Answer, ObjectTracking, rgb_of
 
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d import Frame, FrameEstimate, ObjectModel, Session, Status, load_config
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.run_unit import visible_side
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 """Encodings of pictures: which of a pixel's bytes are red, green and blue."""

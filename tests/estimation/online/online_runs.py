@@ -14,7 +14,7 @@ from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import Angles, aligned_rotation_errors
 
 FRAMES = 14

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from online_runs import estimate_of, final
 
-from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
 from tracking3d.estimation.online.atlas import (
@@ -31,7 +30,8 @@ from tracking3d.estimation.online.state.solver_state import MaskAgreement
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.similarity import Similarity
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.results.checkpoint.serialization import TreeFolder
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FIRST, HIDDEN = 12, 3

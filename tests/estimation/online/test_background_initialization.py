@@ -19,8 +19,8 @@ from tracking3d.estimation.online.initialization.pending_frames import try_initi
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.pipeline.session import Session
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.runtime.background_attempt import BackgroundAttempt
+from tracking3d.trackers.prompts.prompt import make_prompt
 
 is_done = BackgroundAttempt.is_done
 PATIENCE = 120.0

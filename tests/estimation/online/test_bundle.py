@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
-from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damp, adjust
-from tracking3d.bundle_adjustment.reprojection import transform_to_camera
+from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damp, adjust
+from tracking3d.points.bundle_adjustment.reprojection import transform_to_camera
 
 
 def problem(given, fixed=1, free_focal=False, prior_weight=0.0):

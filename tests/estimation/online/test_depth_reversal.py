@@ -13,16 +13,16 @@ from solid_points import map_with_points
 from tracked_solids import scene
 from turned_solid import CAMERA, SIZE, degrees_apart
 
-from tracking3d.bundle_adjustment.adjustment import reversal_of
-from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online import mapper
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapper import fix_depth_reversal
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.segmentation.online_motion_cue import MotionReference
 from tracking3d.geometry.pose import pose_from_arrays
-from tracking3d.segmentation.online_motion_cue import MotionReference
+from tracking3d.points.bundle_adjustment.adjustment import reversal_of
+from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 
 ANGLES = [0.0, 10.0, 20.0, 30.0, 40.0]
 

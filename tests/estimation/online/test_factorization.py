@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
-from tracking3d.bundle_adjustment.adjustment import Structure
-from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.estimation.online.initialization.structure_from_motion import (
     affine_motion,
     align_with_axis,
@@ -17,6 +15,8 @@ from tracking3d.estimation.online.initialization.structure_from_motion import (
     measured_relief,
     metric_structure,
 )
+from tracking3d.points.bundle_adjustment.adjustment import Structure
+from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 
 
 def far_away(frames: int, **settings):

@@ -17,7 +17,7 @@ from tracking3d.estimation.online.initialization.pending_frames import try_initi
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES, SOLVED = 20, 6

@@ -10,12 +10,12 @@ import torch
 from tracked_solids import SIZE, degrees_between, scene
 from turned_solid import turned_map
 
-from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping import focal_length
 from tracking3d.estimation.online.mapping.focal_length import solve_lens
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays, pose_from_arrays
+from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
 
 
 def solved_with(

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from turned_solid import degrees_apart
 
-from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
@@ -27,6 +26,7 @@ from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.geometry.prototypes import ellipsoid
 from tracking3d.rendering import TexelMap, render
+from tracking3d.results.checkpoint.serialization import TreeFolder
 
 SIZE, FINE = 96, 3
 UPRIGHT = np.array([0.0, 1.0, 0.0])

@@ -21,7 +21,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES = 13

@@ -19,7 +19,7 @@ from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering import project
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 FRAMES, FOV = 14, 12.0

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import Tracks
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.initialization import photo_start
@@ -33,7 +32,8 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     match_photos,
     neighbouring_pairs,
 )
-from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.points.bundle_adjustment.adjustment import Tracks
+from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 STEP = 20.0

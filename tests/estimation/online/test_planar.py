@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, scene
 
-from tracking3d.bundle_adjustment.adjustment import Tracks
 from tracking3d.estimation.online.initialization.structure_from_motion import (
     _fit_plane_structure,
     is_planar,
     planar_structures,
     resect_views,
 )
+from tracking3d.points.bundle_adjustment.adjustment import Tracks
 
 
 def flat_scene(**settings):

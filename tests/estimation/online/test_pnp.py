@@ -8,8 +8,8 @@ import pytest
 import torch
 from tracked_solids import degrees_between, scene
 
-from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.estimation.online.optimization.pnp import pose_from_points, pose_of_tracks
+from tracking3d.points.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.rendering.normal_equations import NormalEquations
 
 THRESHOLD = 1.5

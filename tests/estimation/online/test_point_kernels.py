@@ -10,8 +10,8 @@ import pytest
 from tracked_solids import disturbed, scene
 from twins import bundle_adjustment, pose_from_points
 
-from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, System, adjust
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
+from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, System, adjust
 from tracking3d.rendering.kernels.compilation import get_num_threads, set_num_threads
 
 SCENES = {

@@ -10,11 +10,11 @@ import torch
 from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.optimization.pose_refinement import _Evidence, refine_pose, refine_poses
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
+from tracking3d.points.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.rendering import MatchedPoints, Surface
 
 TRUTH = pose_of(20)

@@ -6,7 +6,7 @@ import numpy as np
 from tracked_solids import intrinsics
 from twins.reprojection import pixel_by_point, pixel_by_pose
 
-from tracking3d.bundle_adjustment.reprojection import (
+from tracking3d.points.bundle_adjustment.reprojection import (
     apply_pose_steps,
     finite_rows,
     project_camera_points,

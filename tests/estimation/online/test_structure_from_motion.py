@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
-from tracking3d.bundle_adjustment.adjustment import Tracks, adjust
 from tracking3d.estimation.online.initialization.structure_from_motion import (
     image_deformation,
     register_all,
     structure_hypotheses,
 )
+from tracking3d.points.bundle_adjustment.adjustment import Tracks, adjust
 
 
 def errors(found, given) -> list[float]:

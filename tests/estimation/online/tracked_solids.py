@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import Structure, Tracks
-from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
+from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks
+from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 
 SIZE = (640, 480)
 RADIUS = 0.9

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.networks.catalogue import known_networks
+from tracking3d.features.networks.catalogue import known_networks
 from tracking3d.trackers.onnx.description import (
     PromptableNetwork,
     SaliencyNetwork,

@@ -144,7 +144,7 @@ def run(
     To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html
     grow as videos finish. The exit code is 1 if a video failed.
     """
-    from tracking3d.prompts.boxes import check_box_format
+    from tracking3d.trackers.prompts.boxes import check_box_format
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
@@ -154,7 +154,7 @@ def run(
             "--sequence names sequences of a dataset; give its folder with --data, or leave it out."
         )
     if split is not None:
-        from tracking3d.submaps.cuts import parse_length
+        from tracking3d.pipeline.submaps.cuts import parse_length
 
         parse_length(split, 1e9)  # refuses what is no length at any frame rate
     # Fail once for a wrong option, not once per video.
@@ -244,7 +244,7 @@ def _check_split(
     split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
 ) -> None:
     from tracking3d.batch.storage import local
-    from tracking3d.submaps.job import refuse_what_cannot_be_joined
+    from tracking3d.pipeline.submaps.job import refuse_what_cannot_be_joined
 
     refuse_what_cannot_be_joined(settings)
     if data is not None:

@@ -154,6 +154,6 @@ class PerformanceOptions:
         if self.workers is not None and self.split is None:
             raise InputError("--workers is the number of parts that --split tracks at a time; add --split.")
         if self.split is not None:
-            from tracking3d.submaps.cuts import parse_length
+            from tracking3d.pipeline.submaps.cuts import parse_length
 
             parse_length(self.split, 1e9)  # refuses what is no length at any frame rate

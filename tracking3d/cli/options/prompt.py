@@ -111,7 +111,7 @@ class PromptOptions:
                 read.
         """
         from tracking3d.config.loading import load_prompt
-        from tracking3d.prompts.boxes import check_box_format
+        from tracking3d.trackers.prompts.boxes import check_box_format
 
         in_file = load_prompt(config)
         given = self

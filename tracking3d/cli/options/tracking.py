@@ -189,7 +189,7 @@ class CameraOptions:
             intrinsics, file = None, intrinsics
         camera: dict[str, Any] = {"fov": self.fov, "file": file}
         if file is not None:
-            from tracking3d.calibration.camera_files import read_camera
+            from tracking3d.geometry.calibration.camera_files import read_camera
 
             if not (self.fov is intrinsics is self.distortion is None):
                 raise InputError(
@@ -204,7 +204,7 @@ class CameraOptions:
 
 
 def _parse_distortion(text: str) -> dict[str, Any]:
-    from tracking3d.calibration.camera_files import as_coefficients
+    from tracking3d.geometry.calibration.camera_files import as_coefficients
 
     name, colon, values = text.rpartition(":")
     model = name.strip().casefold() if colon else "radtan"

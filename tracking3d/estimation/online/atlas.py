@@ -33,11 +33,11 @@ from tracking3d.estimation.online.relocalization import poses_from_matches
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.estimation.segmentation import as_lab
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.geometry.similarity import Similarity
-from tracking3d.segmentation import as_lab
 
 _MAX_UNALIGNED_CONFIDENCE = 0.05  # highest confidence while the transform between two maps is only a guess
 _MAX_INACTIVE = 4

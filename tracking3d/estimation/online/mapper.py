@@ -1,7 +1,7 @@
 """The mapper: inserts a frame into the map, refines it, and reverses its depth if that explains its keyframes better.
 
 The initialization chooses between the two reversals; after a small rotation its choice can be wrong. See
-`tracking3d.bundle_adjustment.adjustment`.
+`tracking3d.points.bundle_adjustment.adjustment`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
@@ -29,6 +28,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
+from tracking3d.points.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
 from tracking3d.runtime.stage_times import in_stage
 
 _MIN_LANDMARKS = 12

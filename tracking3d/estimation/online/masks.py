@@ -16,11 +16,7 @@ from tracking3d.estimation.online.optimization.pose_refinement import least_cons
 from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import MaskAgreement, SolverState
-from tracking3d.frames import Frame
-from tracking3d.geometry.camera import Camera, Window
-from tracking3d.geometry.pose import Pose
-from tracking3d.scene.view import ObjectView, crop_window, inside_frame
-from tracking3d.segmentation import (
+from tracking3d.estimation.segmentation import (
     ColourModels,
     as_lab,
     blend_with_initial,
@@ -32,15 +28,19 @@ from tracking3d.segmentation import (
     pose_weight,
     snap_to_edges,
 )
-from tracking3d.segmentation.initial_mask_agreement import InitialMaskAgreement, smoothing_of
-from tracking3d.segmentation.online_motion_cue import (
+from tracking3d.estimation.segmentation.initial_mask_agreement import InitialMaskAgreement, smoothing_of
+from tracking3d.estimation.segmentation.online_motion_cue import (
     MotionReference,
     grow_region,
     motion_supported_share,
     online_motion_log_odds,
     unlike_surroundings,
 )
-from tracking3d.segmentation.whole_video import draw_around_masks
+from tracking3d.estimation.segmentation.whole_video import draw_around_masks
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.pose import Pose
+from tracking3d.scene.view import ObjectView, crop_window, inside_frame
 
 
 def initial_estimate(
@@ -162,7 +162,7 @@ def share_beyond(mask: NDArray[np.bool_], silhouette: NDArray[np.bool_]) -> floa
 
 
 def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
-    """The agreement of the keyframes' masks; see `tracking3d.segmentation.initial_mask_agreement`."""
+    """The agreement of the keyframes' masks; see `tracking3d.estimation.segmentation.initial_mask_agreement`."""
     vertices = object_map.vertices.cpu().numpy().astype(np.float64)
     faces = object_map.shape.faces.cpu().numpy().astype(np.int64)
     views = [view for view in object_map.keyframes if view.mask is not None and view.mask.any()]
@@ -183,8 +183,8 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
 
 
 _DISPUTED = 0.5
-"""See `tracking3d.segmentation.in_question`: if both outlines nearly agree, as exact masks do, nothing is missing that
-motion could add."""
+"""See `tracking3d.estimation.segmentation.in_question`: if both outlines nearly agree, as exact masks do, nothing is
+missing that motion could add."""
 _UPSAMPLING = 2
 """Pixels of the fusion window for each pixel of the observation's window, per side."""
 

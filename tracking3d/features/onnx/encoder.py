@@ -13,9 +13,9 @@ from torch.nn import functional
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.networks.catalogue import description_names, read_description
-from tracking3d.networks.session import Network, TensorInfo
-from tracking3d.networks.store import find_network
+from tracking3d.features.networks.catalogue import description_names, read_description
+from tracking3d.features.networks.session import Network, TensorInfo
+from tracking3d.features.networks.store import find_network
 
 _HOW_TO = "describe the network in a YAML file and set features.description to it"
 _TRIAL_SIDE = 64  # pixels, enlarged to a multiple of what the network wants

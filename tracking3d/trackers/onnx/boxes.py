@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
-from tracking3d.networks.session import Network
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
 from tracking3d.trackers.onnx.images import TRIAL_BOX, TRIAL_IMAGE

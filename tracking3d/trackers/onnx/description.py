@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.networks.catalogue import description_names, read_description
+from tracking3d.features.networks.catalogue import description_names, read_description
 
 PACKAGE = "tracking3d.trackers.onnx"
 """The package whose folder ``descriptions`` holds the built-in descriptions."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
-from tracking3d.networks.session import Network
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.onnx.description import Decoder, PromptableNetwork
 from tracking3d.trackers.onnx.images import (

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
-from tracking3d.networks.session import Network
 from tracking3d.trackers.onnx.description import SaliencyNetwork
 from tracking3d.trackers.onnx.images import (
     Proposal,

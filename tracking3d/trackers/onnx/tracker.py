@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.features.networks.store import find_network
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
-from tracking3d.networks.store import find_network
 from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
 from tracking3d.trackers.csrt import CsrtTracker
 from tracking3d.trackers.first_mask import mask_in_box

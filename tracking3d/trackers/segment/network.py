@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.features.networks.session import Network
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
-from tracking3d.networks.session import Network
 from tracking3d.scene.view import FrameCrop, crop_window
 from tracking3d.trackers.colour_models import GlobalColours
 from tracking3d.trackers.crops import box_of, clip_box

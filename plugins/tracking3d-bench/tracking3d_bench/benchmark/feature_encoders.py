@@ -18,7 +18,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Image
 from tracking3d.plugins import FEATURES, build_plugin, list_plugins, load_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder
-from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
+from tracking3d.testing.synthesis.procedural_texture import paint_background, paint_panel
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import images_among
 from tracking3d_bench.benchmark.matching import MatchingPair, MatchingScores, matching_scores

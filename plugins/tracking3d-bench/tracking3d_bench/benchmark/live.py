@@ -14,8 +14,8 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
 from tracking3d.pipeline.track import Session
-from tracking3d.prompts.prompt import make_prompt
 from tracking3d.runtime.stage_times import StageTimes
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video.image_file import read_image
 from tracking3d.video.latest_frames import newest
 from tracking3d_bench.datasets.truth import Truth

@@ -20,7 +20,7 @@ from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, check_options, plugin_label
 from tracking3d.plugins.guard import GuardedTracker
-from tracking3d.prompts.prompt import make_prompt
+from tracking3d.trackers.prompts.prompt import make_prompt
 from tracking3d.video.image_file import read_image
 from tracking3d_bench.benchmark.sequences import Dataset
 from tracking3d_bench.datasets.answers import Answers

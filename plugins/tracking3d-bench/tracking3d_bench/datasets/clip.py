@@ -33,7 +33,7 @@ from tracking3d.frames import Box
 from tracking3d.geometry.alignment import is_rigid, nearest_rigid
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.array_files import ArrayFile
-from tracking3d.synthesis.convex_clips import write_clip as write_clip
+from tracking3d.testing.synthesis.convex_clips import write_clip as write_clip
 from tracking3d.trackers.crops import box_of
 from tracking3d.video.image_sequence import images_among
 from tracking3d_bench.datasets.cameras import read_clip_camera

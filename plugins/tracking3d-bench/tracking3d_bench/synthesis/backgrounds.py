@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.procedural_texture import paint_background
+from tracking3d.testing.synthesis.procedural_texture import paint_background
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import images_among
 from tracking3d_bench.synthesis.spec import PROCEDURAL_BACKGROUND, SequenceSpec

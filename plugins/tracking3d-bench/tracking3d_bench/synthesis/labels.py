@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.procedural_texture import FloatImage, paint_panel
+from tracking3d.testing.synthesis.procedural_texture import FloatImage, paint_panel
 from tracking3d_bench.synthesis.patches import Array, Patch
 
 _WIDTH, _HEIGHT = (0.35, 0.55), (0.22, 0.36)  # of a label, in object coordinates

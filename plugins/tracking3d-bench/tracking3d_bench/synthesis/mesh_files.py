@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.geometry.mesh_checks import sound_mesh_file
-from tracking3d.synthesis.procedural_texture import plain_colour
+from tracking3d.testing.synthesis.procedural_texture import plain_colour
 from tracking3d_bench.synthesis.solid import Solid
 from tracking3d_bench.synthesis.spec import SequenceSpec
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.procedural_texture import paint_bands, paint_panel, paint_plain
+from tracking3d.testing.synthesis.procedural_texture import paint_bands, paint_panel, paint_plain
 from tracking3d_bench.synthesis.labels import stick_label
 from tracking3d_bench.synthesis.patches import (
     Array,

@@ -16,7 +16,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
+from tracking3d.testing.synthesis.procedural_texture import paint_background, paint_panel
 from tracking3d_bench.synthesis.camera_effects import linear
 from tracking3d_bench.synthesis.motions import Path
 from tracking3d_bench.synthesis.patches import Array, Patch, prism, rectangle

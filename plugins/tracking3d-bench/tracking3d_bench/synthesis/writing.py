@@ -20,7 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_atomic, write_image, write_mask, write_together, writing
 from tracking3d.results.layout import partial_path
 from tracking3d.runtime.interruption import interrupts_deferred
-from tracking3d.synthesis.convex_clips import POSE_CONVENTION
+from tracking3d.testing.synthesis.convex_clips import POSE_CONVENTION
 from tracking3d_bench.synthesis.camera_effects import compress
 from tracking3d_bench.synthesis.frame_rendering import RenderedFrame, render_frame
 from tracking3d_bench.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks

@@ -9,8 +9,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
-from tracking3d.prompts.prompt import make_prompt, validate_box
 from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.prompts.prompt import make_prompt, validate_box
 from tracking3d.trackers.vot_regions import Polygon, rasterise
 
 

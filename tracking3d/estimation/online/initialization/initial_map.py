@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import downsample
 from tracking3d.estimation.online.features.klt import FollowedPoints
@@ -37,6 +36,7 @@ from tracking3d.geometry.pose import (
     rotation_about,
     rotation_angle,
 )
+from tracking3d.points.bundle_adjustment.adjustment import Structure
 
 _VIEWS = 8
 _ROTATION_FRAMES = (

@@ -23,8 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust, reversal_of
-from tracking3d.bundle_adjustment.reprojection import FloatArray, transform_to_camera
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -50,6 +48,8 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import RADIUS
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays, pose_from_arrays
+from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks, adjust, reversal_of
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray, transform_to_camera
 
 MOST_PHOTOS = 60
 """Photos that are joined at once (chosen: all pairs of them are matched in a minute)."""

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.adjustment import Tracks
-from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.points.bundle_adjustment.adjustment import Tracks
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 
 # Of a photo, which has few neighbours (measured: 14 of 20 photos of the car are joined, with half as many keypoints 9).
 _KEYPOINTS, _SIZE, _CONTRAST, _RATIO = 1000, 600, 0.005, 0.85

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.adjustment import Tracks
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow, new_corners
 from tracking3d.estimation.online.initialization.structure_from_motion import image_deformation
+from tracking3d.points.bundle_adjustment.adjustment import Tracks
 
 _EVERY = 10  # frames from one window to the next
 _LENGTH = 45  # frames of a window

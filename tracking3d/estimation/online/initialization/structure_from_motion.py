@@ -1,9 +1,9 @@
 """Poses and points of the first frames from tracks alone: several hypotheses, because the image allows several.
 
 A small object is seen almost without perspective. Its reversal in depth (Necker) then fits nearly as well as itself,
-with two views any amount of relief does (bas-relief), and a plane has two rotations. So several hypotheses are refined
-under perspective by `tracking3d.bundle_adjustment.adjustment`, and the distinct ones are kept; rendering them shows
-which is correct.
+with two views any amount of relief does (bas-relief), and a plane has two rotations. So several hypotheses are
+refined under perspective by `tracking3d.points.bundle_adjustment.adjustment`, and the distinct ones are kept;
+rendering them shows which is correct.
 """
 
 from __future__ import annotations
@@ -16,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System, Tracks, adjust
-from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
+from tracking3d.points.bundle_adjustment.adjustment import (
+    AdjustmentProblem,
+    Structure,
+    System,
+    Tracks,
+    adjust,
+)
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray, finite_rows
 
 RELIEFS = (0.3, 0.7)
 """Depths that are tried if the views do not constrain it: spread about the tilted plane over the spread in x and y."""

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.estimation.online.mapping.local_mapping import shared_landmarks, structure_of, tracks_of
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
 from tracking3d.geometry.camera import OUTERMOST_LENSES, Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
+from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""

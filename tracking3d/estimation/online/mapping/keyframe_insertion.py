@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.adjustment import Structure, adjust
-from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
@@ -31,6 +29,8 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, rotation_angle
+from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
+from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.view import LANDMARK_WINDOW, cut_window, draw_into_window
 from tracking3d.scene.surface import Drawn

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints, match
 from tracking3d.estimation.online.optimization.shape_fit import (
@@ -22,6 +21,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
+from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.rendering import project as project_vertices
 from tracking3d.rendering import rasterize
 
@@ -214,7 +214,7 @@ def refine_map(
         positions: Positions of the keyframes to refine; the poses of the first ``fixed`` are held.
         weights: The weights of the shape's terms.
         prior: Cost of a landmark at distance 1 from the surface, see
-            `tracking3d.bundle_adjustment.adjustment.adjust`.
+            `tracking3d.points.bundle_adjustment.adjustment.adjust`.
         scale: Scale in pixels of the robust loss.
         bundle_iterations: Iterations of the bundle adjustment.
         rounds: Rounds of the shape fit.

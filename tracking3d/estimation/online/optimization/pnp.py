@@ -12,8 +12,8 @@ import math
 import cv2
 import numpy as np
 
-from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.optimization.types import PnPFit, PoseHypothesis
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray, finite_rows
 
 _MIN_INLIERS = 4
 _SAMPLES = 500

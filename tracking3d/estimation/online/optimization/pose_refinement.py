@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.optimization.types import (
     ENOUGH,
@@ -28,6 +27,7 @@ from tracking3d.estimation.online.optimization.types import (
     PoseWeights,
 )
 from tracking3d.geometry.pose import Pose, from_matrix
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
 from tracking3d.rendering import MatchedPoints, Scales, Surface, pose_terms
 from tracking3d.rendering.backend import use_numba
 

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.config.models import OnlineConfig
 from tracking3d.geometry.pose import Pose
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 from tracking3d.rendering import NormalEquations
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3

@@ -17,13 +17,13 @@ from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.segmentation import ColourModels
+from tracking3d.estimation.segmentation.online_motion_cue import MotionReference
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import Surface
 from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.scene.view import FrameCrop
-from tracking3d.segmentation import ColourModels
-from tracking3d.segmentation.online_motion_cue import MotionReference
 
 MOST_WAITING = 40
 """Most frames that are kept with their estimates because their poses may come or change later."""

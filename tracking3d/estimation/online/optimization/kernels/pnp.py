@@ -7,7 +7,10 @@ import math
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.kernels.reprojection import (
+from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
+from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
+from tracking3d.points.bundle_adjustment.kernels.reprojection import (
     factorize,
     pixel_motion,
     rotate_by,
@@ -15,10 +18,7 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     solve_factorised,
     to_camera,
 )
-from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
-from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
-from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
-from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
+from tracking3d.points.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 
 

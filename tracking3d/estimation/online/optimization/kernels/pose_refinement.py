@@ -10,13 +10,6 @@ import numpy as np
 from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.kernels.reprojection import (
-    factorize,
-    rotate_by,
-    shared,
-    solve_factorised,
-)
-from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.optimization.types import (
     ENOUGH,
     FIRST_DAMPING,
@@ -26,6 +19,13 @@ from tracking3d.estimation.online.optimization.types import (
     EvaluatedPoses,
     PoseWeights,
 )
+from tracking3d.points.bundle_adjustment.kernels.reprojection import (
+    factorize,
+    rotate_by,
+    shared,
+    solve_factorised,
+)
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
 from tracking3d.rendering.kernels.compilation import kernel, record, share
 from tracking3d.rendering.kernels.pose_terms import (

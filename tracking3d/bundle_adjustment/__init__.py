@@ -1,5 +1,0 @@
-"""Poses and points of one rigid object that explain tracked pixels best, over any number of frames."""
-
-from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
-
-__all__ = ["Structure", "Tracks", "adjust"]
