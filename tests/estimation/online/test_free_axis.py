@@ -184,6 +184,14 @@ def test_the_solver_asks_at_due_keyframes_of_maps_without_points_and_its_state_c
     found = asked(state)
     assert degrees_off(found.object_map.free_axis) < 3 and found.previous_pose is None
     assert found.surface is not None and torch.equal(found.surface.vertices, found.object_map.vertices)
+    nubs = [
+        replace(view, observation=replace(view.observation, index=90 + n))
+        for n, view in enumerate(tumbling(handle=0.6).keyframes)
+    ]
+    in_sight = replace(found, last_pose=(last.pose, 12), revisable=tuple((view, None) for view in nubs))
+    assert asked(replace(in_sight, last_pose=(last.pose, 13))).object_map is found.object_map
+    assert asked(replace(in_sight, revisable=())).object_map is found.object_map
+    assert asked(in_sight).object_map.free_axis is None
     kept = TreeFolder(tmp_path, OnlineSolver.state_classes)
     axis = kept.read(json.loads(kept.text(found.object_map.free_axis)))
     assert np.array_equal(axis.direction, found.object_map.free_axis.direction)

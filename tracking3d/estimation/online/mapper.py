@@ -42,7 +42,9 @@ _ALWAYS_TRIED = 12
 it costs as much as bundle adjustment of all keyframes, and similar keyframes add no evidence."""
 _MORE_KEYFRAMES, _MORE_TURNED = 1.25, 4.0
 _ITERATIONS = 20
-_ASKED = 4  # keyframes between two questions whether the object is a surface of revolution (chosen)
+_ASKED, _FRAMES_ASKED = 4, 6
+"""Keyframes between two questions whether an object is a surface of revolution, and frames between two questions
+whether it still is (chosen)."""
 _LANDMARK_PRIOR = (
     0.05  # cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
 )
@@ -69,22 +71,24 @@ def insert_frame(
 def adopt_free_axis(state: SolverState, config: OnlineConfig) -> SolverState:
     """The state before the next frame, with a surface of revolution if its keyframes tell that it is one.
 
-    It is asked at every fourth keyframe, and takes seconds.
+    It is asked at every fourth keyframe, and takes seconds. Whether the surface still is one is asked every few frames:
+    a nub or a handle may have come into sight.
     """
     object_map, last = state.object_map, state.object_map.keyframes[-1]
-    due = last.index == state.last_pose[1] and len(object_map.keyframes) % _ASKED == 0
-    asked = object_map.pointless and object_map.free_axis is None and not object_map.fixed_keyframes
-    if state.inactive_maps or not (due and asked):
+    known, newest = object_map.free_axis is not None, state.last_pose[1]
+    due = last.index == newest and len(object_map.keyframes) % _ASKED == 0
+    due = due or (known and newest % _FRAMES_ASKED == 0)
+    if state.inactive_maps or object_map.fixed_keyframes or not (object_map.pointless and due):
         return state
     with in_stage("map"):
         weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
         object_map = as_surface_of_revolution(object_map, weights, others)
-    if object_map.free_axis is None:
-        return state
+    if known or object_map.free_axis is None:
+        return state if object_map is state.object_map else replace(state, object_map=object_map)
     last = object_map.keyframes[-1]
-    known = last.pose, last.index
+    here = last.pose, last.index
     return state.with_map(
-        object_map, last_pose=known, previous_pose=None, trajectory=(known,), baseline=LossBaseline()
+        object_map, last_pose=here, previous_pose=None, trajectory=(here,), baseline=LossBaseline()
     )
 
 
