@@ -48,7 +48,7 @@ ROOM_LINES = {
     "results": 6750,
     "runtime": 1150,
     "scene": 350,
-    "testing": 1050,
+    "testing": 1100,
     "trackers": 6250,
     "ui": 5100,
     "video": 2500,

@@ -7,7 +7,18 @@
 A check that fails raises `AssertionError` with a sentence that says what was expected.
 """
 
-from tracking3d.testing.encoders import check_encoder
-from tracking3d.testing.trackers import check_tracker
+from typing import TYPE_CHECKING
+
+from tracking3d.runtime.deferred_import import import_on_use
+
+if TYPE_CHECKING:
+    from tracking3d.testing.encoders import check_encoder
+    from tracking3d.testing.trackers import check_tracker
 
 __all__ = ["check_encoder", "check_tracker"]
+
+# Who makes a synthetic clip need not wait for torch.
+__getattr__ = import_on_use(
+    __name__,
+    {"check_encoder": "tracking3d.testing.encoders", "check_tracker": "tracking3d.testing.trackers"},
+)
