@@ -11,7 +11,6 @@ from pathlib import Path
 
 from tracking3d.config.models import AUTO, PipelineConfig, PluginChoice
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, Prompt, SkippedFrame
 from tracking3d.pipeline.components import build_encoder, check_backward_tracking
 from tracking3d.pipeline.frame_reading import read_from
@@ -25,12 +24,7 @@ from tracking3d.pipeline.validation import (
 )
 from tracking3d.results.layout import RUN
 from tracking3d.results.run_reader import RunReader
-from tracking3d.trackers.prompts.corrections import (
-    Correction,
-    check_corrections_fit,
-    prompts_in,
-    validate_corrections,
-)
+from tracking3d.trackers.prompts.corrections import Correction, check_corrections_fit, validate_corrections
 from tracking3d.trackers.prompts.prompt import PromptSet, damaged_start_error
 from tracking3d.video.both_ways import check_start_frame
 from tracking3d.video.source import FrameSource, is_live, known_indices
@@ -91,19 +85,6 @@ class TrackedObject:
     # the object in the prompt frame; None if the mask tracker or an earlier run knows it
     prompt: Prompt | None
     corrections: Mapping[int, Correction]  # what the object is in later frames, by their index
-
-    def step(self, frame: Frame, coming: Frame | None = None) -> FrameEstimate:
-        """Estimate the object in the next frame.
-
-        Args:
-            frame: The frame.
-            coming: The frame of the next call, if it is known.
-
-        Raises:
-            Tracking3dError: See `Session.step`.
-        """
-        self.session.coming = coming
-        return self.session.step(frame, *prompts_in(frame, self.corrections))
 
 
 @dataclass(frozen=True, eq=False)

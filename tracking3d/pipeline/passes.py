@@ -4,7 +4,7 @@ In short::
 
     for frame in frames:                             # first pass: causal estimates
         for recording in active:
-            recording.take(frame)                    # TrackedObject.step, Session.step, Solver.step
+            recording.take(frame)                    # Session.step, Solver.step
     for recording in active:
         recording.begin_refinement(source)           # everything is refined
     for frame in frames:                             # second pass: estimates with the final model
@@ -87,21 +87,11 @@ class ActiveRecordings:
             self._listener(done)
 
 
-def run_passes(
-    source: FrameSource,
-    frames: Iterable[Frame | SkippedFrame],
-    recordings: Sequence[ObjectRecorder],
-    listener: Listener,
-    first_pass_only: bool = False,
-) -> None:
-    """Run all passes. A recording that fails is ended; the others continue.
-
-    Args:
-        source: The source of the frames.
-        frames: Its frames, begun already.
-        recordings: One for each object.
-        listener: Is called with every frame of every object.
-        first_pass_only: Stop when every frame has its causal estimate.
+@contextmanager
+def running(
+    source: FrameSource, recordings: Sequence[ObjectRecorder], listener: Listener
+) -> Iterator[ActiveRecordings]:
+    """The recordings that take the frames of a source; one that fails is ended, and the others continue.
 
     Raises:
         Tracking3dError: The first failure, at the end or as soon as no recording is left.
@@ -112,25 +102,32 @@ def run_passes(
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            waits = any(one.needs_first_pass for one in active)
-            with closing(report_each("tracking", read_with_next(source, frames), source.count)) as arriving:
-                for frame, coming in arriving if waits else ():
-                    shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
-                    for recording in active:
-                        with active.guard(recording):
-                            active.tell(recording.take(shared, coming))
-            _finish_writing(active)
-            if first_pass_only:
-                for recording in active:
-                    with active.guard(recording):
-                        recording.pause()
-                return
-            run_refinement(source, active)
+            yield active
         except BaseException as error:
             active.give_up(error)
             raise
     if active.errors:
         raise active.errors[0]
+
+
+def first_pass(
+    source: FrameSource, frames: Iterable[Frame | SkippedFrame], active: ActiveRecordings
+) -> Generator[tuple[ObjectRecorder, Frame | SkippedFrame, Frame | SkippedFrame | None]]:
+    """Each frame, for each recording, with the frame after it; none if no recording needs them.
+
+    Args:
+        source: The source of the frames.
+        frames: Its frames, begun already.
+        active: The recordings. When it ends, what they write in other threads is written.
+    """
+    objects = len(active)
+    waits = any(one.needs_first_pass for one in active)
+    with closing(report_each("tracking", read_with_next(source, frames), source.count)) as arriving:
+        for frame, coming in arriving if waits else ():
+            shared = with_share(frame, objects) if isinstance(frame, Frame) else frame
+            for recording in active:
+                yield recording, shared, coming
+    _finish_writing(active)
 
 
 def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from tracking3d.frames import Box
 from tracking3d.pipeline.frame_reading import read_again
 from tracking3d.pipeline.known_object import select_camera
 from tracking3d.pipeline.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
-from tracking3d.pipeline.passes import Listener, run_passes
+from tracking3d.pipeline.passes import Listener, first_pass, run_refinement, running
 from tracking3d.pipeline.recorder import ObjectRecorder
 from tracking3d.pipeline.session import Session
 from tracking3d.pipeline.validation import validate_folder
@@ -199,11 +199,20 @@ def record_tracking(
             begin_recording(opened, number, into, options, writers) for number, into in enumerate(folders)
         ]
         if unfinished := [recording for recording in recordings if recording is not None]:
-            run_passes(opened.source, opened.frames, unfinished, listener, options.first_pass_only)
-    for into, recording in zip(folders, recordings, strict=True):
+            with running(opened.source, unfinished, listener) as active:
+                with closing(first_pass(opened.source, opened.frames, active)) as arriving:
+                    for recording, frame, coming in arriving:
+                        with active.guard(recording):
+                            active.tell(recording.take(frame, coming))
+                if not options.first_pass_only:
+                    run_refinement(opened.source, active)
+                for recording in active if options.first_pass_only else ():
+                    with active.guard(recording):
+                        recording.pause()
+    for into, recorded in zip(folders, recordings, strict=True):
         if options.first_pass_only:
             continue
-        if recording is None:
+        if recorded is None:
             complete_run(into, opened.config, opened.source)
         elif "shape" not in RunReader(into).description:
             make_final_shape(into, opened.config, opened.source)

@@ -120,7 +120,8 @@ class ObjectRecorder:
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or self._state.has(coming.index):
             coming = None
-        estimate = self._tracked.step(frame, coming)
+        self._session.coming = coming
+        estimate = self._session.step(frame, *prompts_in(frame, self._tracked.corrections))
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
         if self._refines:

@@ -141,7 +141,20 @@ class Session(SessionRefinement):
         check_frame(frame)
         try:
             with self._settings.in_force(), measure("solve") as watch:
-                estimate = self._start(frame) if self._solver is None else self._track(frame, prompt)
+                if self._solver is None:
+                    estimate = self._start(frame)
+                else:
+                    solver, mask = self._solver_for(frame), self._follow_mask(frame, prompt)
+                    try:
+                        shown = self._undistortion.frame(self._presented.number(frame))
+                        if prompt is not None:
+                            self._trust(shown, mask)
+                        self._state, estimate = solver.step(self._state, shown, self._undistortion.mask(mask))
+                        estimate = self._of_picture(estimate, mask)
+                    except PluginFailure as error:
+                        self._tolerate(frame, error)
+                        estimate = lost_estimate(frame, mask, self._last_pose)
+                    estimate = self._remember(frame, estimate, corrected=prompt is not None)
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         return add_times(estimate, watch, frame)
@@ -152,9 +165,7 @@ class Session(SessionRefinement):
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
         self._state, estimate = solver.init(self._undistortion.frame(frame), self._undistortion.mask(mask))
-        estimate = replace(self._undistortion.estimate(estimate, mask), occluder=mask.occluder)
-        if self.config.object.trust_masks:
-            estimate = with_initial_mask(estimate)
+        estimate = self._of_picture(estimate, mask)
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
         if self._tracker.waits:
@@ -272,56 +283,56 @@ class Session(SessionRefinement):
                 raise error.at(frame.label) from error.__cause__
         return estimate
 
-    def _track(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
+    def _follow_mask(self, frame: Frame, prompt: Prompt | None) -> MaskEstimate:
+        """The mask tracker's estimate; if it fails, the one before, without a score."""
+        self.corrected = False
+        try:
+            mask = self._tracker.step(frame, prompt)
+            self._tracker.announce(self.coming)
+        except PluginFailure as error:
+            self._tolerate(frame, error)
+            mask = replace(self.initial_mask, score=0.0, reason=error.reason)
+        self.initial_mask = mask
+        return mask
+
+    def _trust(self, shown: Frame, mask: MaskEstimate) -> None:
+        """Have the solver trust the mask of a corrected frame, which is ``shown`` to it next."""
+        if mask.found is not None and isinstance(self._solver, RefiningSolver):
+            trusted = self._undistortion.binary(mask.found)
+            self._state = self._solver.trust_mask(self._state, shown, trusted)
+
+    def _of_picture(self, estimate: FrameEstimate, mask: MaskEstimate) -> FrameEstimate:
+        """The solver's estimate as one of the frame as it was taken; ``mask`` is its initial mask."""
+        estimate = self._presented.index(self._undistortion.estimate(estimate, mask))
+        estimate = replace(estimate, occluder=mask.occluder)
+        return with_initial_mask(estimate) if self.config.object.trust_masks else estimate
+
+    def _remember(self, frame: Frame, estimate: FrameEstimate, corrected: bool) -> FrameEstimate:
+        """Keep what the next frames need of an estimate, and tell the mask tracker; failures are noted in it.
+
+        Args:
+            frame: The frame.
+            estimate: Its estimate.
+            corrected: Whether the mask tracker was re-anchored in this frame, and stays as it is.
+        """
+        self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
+        for one in (*estimate.revised, estimate):
+            self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose
+        try:
+            if not corrected:
+                self._feed_back(frame, estimate)
+        except PluginFailure as error:
+            self._tolerate(frame, error)
+        revised = tuple(map(self._with_failure, estimate.revised))
+        return self._with_failure(replace(estimate, revised=revised))
+
+    def _solver_for(self, frame: Frame) -> Solver[Any]:
+        """The solver, restarted backwards if this frame is the first one before the prompt frame."""
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{frame.label} has {pixels(frame.size)} pixels but the first frame "
                 f"{pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
-        failures = []
-        self.corrected, solver = False, self._solver_for(frame)
-        try:
-            mask = self._tracker.step(frame, prompt)
-            self._tracker.announce(self.coming)
-        except PluginFailure as error:
-            failures.append(self._tolerate(error))
-            mask = replace(self.initial_mask, score=0.0, reason=error.reason)
-        self.initial_mask = mask
-        try:
-            shown = self._undistortion.frame(self._presented.number(frame))
-            if prompt is not None and mask.found is not None and isinstance(solver, RefiningSolver):
-                trusted = self._undistortion.binary(mask.found)
-                self._state = solver.trust_mask(self._state, shown, trusted)
-            self._state, estimate = solver.step(self._state, shown, self._undistortion.mask(mask))
-            estimate = self._presented.index(self._undistortion.estimate(estimate, mask))
-            estimate = replace(estimate, occluder=mask.occluder)
-            if self.config.object.trust_masks:
-                estimate = with_initial_mask(estimate)
-        except PluginFailure as error:
-            failures.append(self._tolerate(error))
-            estimate = lost_estimate(frame, mask, self._last_pose)
-        self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
-        for one in (*estimate.revised, estimate):
-            self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose
-        if prompt is None:
-            try:
-                self._feed_back(frame, estimate)
-            except PluginFailure as error:
-                failures.append(self._tolerate(error))
-        if failures:
-            self._failures[frame.index] = "; ".join(failures)
-        revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
-        return self._with_failure(replace(estimate, revised=revised))
-
-    def _feed_back(self, frame: Frame, estimate: FrameEstimate) -> None:
-        """Re-anchor the mask tracker to a reliable estimate unlike its own, or to the first one if it waits."""
-        corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
-        if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
-            self.corrected = True
-            self._tracker.correct(frame, estimate.visible_mask)
-
-    def _solver_for(self, frame: Frame) -> Solver[Any]:
-        """The solver, restarted backwards if this frame is the first one before the prompt frame."""
         solver, first = self._solver, self._first
         assert solver is not None and first is not None
         if self._presented.last is None:
@@ -335,11 +346,19 @@ class Session(SessionRefinement):
                 self._state = solver.restart_backwards(self._state, first, self._latest, self._first_pose)
         return solver
 
-    def _tolerate(self, error: PluginFailure) -> str:
-        """Why a plug-in failed, if the run continues in spite of it."""
+    def _feed_back(self, frame: Frame, estimate: FrameEstimate) -> None:
+        """Re-anchor the mask tracker to a reliable estimate unlike its own, or to the first one if it waits."""
+        corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
+        if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
+            self.corrected = True
+            self._tracker.correct(frame, estimate.visible_mask)
+
+    def _tolerate(self, frame: Frame, error: PluginFailure) -> None:
+        """Note why a plug-in failed in a frame, if the run continues in spite of it."""
         if self.config.runtime.on_plugin_failure == "stop":
             raise error
-        return error.reason
+        before = self._failures.get(frame.index)
+        self._failures[frame.index] = f"{before}; {error.reason}" if before else error.reason
 
     def failure_at(self, index: int) -> str:
         """Which plug-in failed at frame ``index``, and why; empty if none did."""

@@ -24,7 +24,7 @@ from tracking3d.pipeline.record import RecordOptions, begin_recording
 from tracking3d.pipeline.result import TemporaryRun, TrackingResult
 from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.run_unit import apply_object_size
-from tracking3d.trackers.prompts.corrections import UnmetCorrections
+from tracking3d.trackers.prompts.corrections import UnmetCorrections, prompts_in
 
 _T = TypeVar("_T")
 
@@ -208,7 +208,8 @@ class _ObjectsInStep:
         for number, one in enumerate(self._objects):
             if number not in self._failures:
                 try:
-                    self._latest[number] = estimate = one.step(shared)
+                    prompts = prompts_in(shared, one.corrections)
+                    self._latest[number] = estimate = one.session.step(shared, *prompts)
                     estimates.append(estimate)
                     continue
                 except PluginError as error:

@@ -13,6 +13,7 @@ from turned_solid import CAMERA, SIZE, turned, turned_map
 
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
+from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.features.klt import MOST_POINTS, FollowedPoints, follow
 from tracking3d.estimation.online.initialization import pending_frames
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
@@ -336,17 +337,17 @@ def test_starts_from_points_stay_if_the_map_without_points_misses_its_masks(aske
 def test_a_map_that_explains_frames_badly_for_long_is_begun_again_twice_at_most(monkeypatch):
     object_map = replace(turned_map([0.0, 10.0, 20.0]), pointless=True)
     better = replace(object_map, keyframes=object_map.keyframes[:2])
-    monkeypatch.setattr(pending_frames, "restart_without_points", lambda *_: better)
+    monkeypatch.setattr(initializer, "restart_without_points", lambda *_: better)
     state = replace(belief_of(STEADY), pending=None, object_map=object_map, misfits=4, lost_frames=2)
-    assert pending_frames.restart_if_misfit(state, CONFIG) is state
-    state = pending_frames.restart_if_misfit(replace(state, misfits=5), CONFIG)
+    assert initializer.restart_if_misfit(state, CONFIG) is state
+    state = initializer.restart_if_misfit(replace(state, misfits=5), CONFIG)
     assert state.object_map is better
     assert state.last_pose == (better.keyframes[-1].pose, better.keyframes[-1].index)
     assert (state.misfits, state.lost_frames, state.restarts) == (0, 0, 1)
-    state = pending_frames.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
+    state = initializer.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
     assert state.object_map is better
     last = replace(state, misfits=9, object_map=object_map)
-    assert pending_frames.restart_if_misfit(last, CONFIG) is last
+    assert initializer.restart_if_misfit(last, CONFIG) is last
 
 
 def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):

@@ -18,10 +18,13 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.initialization.initial_map import InitialMap, with_contrast
+from tracking3d.estimation.online.initialization.initial_map import (
+    InitialMap,
+    restart_without_points,
+    with_contrast,
+)
 from tracking3d.estimation.online.initialization.pending_frames import (
     add_pending_frame,
-    restart_if_misfit,
     try_initialize,
     why_no_map,
 )
@@ -57,7 +60,12 @@ from tracking3d.estimation.online.pose_tracking import (
     resect_pose,
 )
 from tracking3d.estimation.online.relocalization import poses_from_matches
-from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCandidate, assess_pose
+from tracking3d.estimation.online.state.confidence import (
+    ENOUGH_POINTS,
+    LossBaseline,
+    PoseCandidate,
+    assess_pose,
+)
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.shape import Shape, first_translation, mask_ellipse, prototype_mesh
@@ -72,6 +80,8 @@ from tracking3d.runtime.stage_times import in_stage
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
+_LASTING_MISFIT = 5  # frames in a row, see `is_misfit` (chosen)
+_MOST_RESTARTS = 2  # while frames come; once more after the last one
 _RESTARTED = "restarted"  # what the first poses come from, see `FrameEstimate.hypothesis`
 _LAST = "last"  # name of the pose of the frame before, see `pose_predictions`
 _IN_PROGRESS = "the first map is being computed"
@@ -404,6 +414,35 @@ class Initializer:
             state, last_pose=trail[-1], trajectory=tuple(trail[-TRAJECTORY_LENGTH:]), baseline=usual,
             tracked_points=view.points,
         ), revised, trail  # fmt: skip
+
+
+def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
+    """The state before the next frame, its map restarted if that has explained the last frames badly for long.
+
+    It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
+    """
+    known = state.object_map.fixed_keyframes > 0
+    if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
+        return state
+    restarts = state.restarts + 1
+    again = state.revisable if restarts < _MOST_RESTARTS else ()
+    state = replace(state, misfits=0, restarts=restarts, revisable=again)
+    weights = FitWeights(smoothness=config.smoothness)
+    object_map = restart_without_points(state.object_map, state.camera, weights)
+    if object_map is state.object_map:
+        return state
+    last = object_map.keyframes[-1]
+    return state.with_map(
+        object_map,
+        last_pose=(last.pose, last.index),
+        previous_pose=None,
+        trajectory=((last.pose, last.index),),
+        baseline=LossBaseline(),
+        lost_frames=0,
+        doubtful_frames=0,
+        last_candidate=None,
+        motion_references=(),
+    )
 
 
 def _find_photo(state: SolverState, frame: Frame, mask: MaskEstimate) -> FrameEstimate:

@@ -134,7 +134,8 @@ class OnlineSolver:
         options: OnlineConfig,
     ) -> tuple[SolverState, FrameEstimate]:
         """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
-        found = self.tracker.track(state, frame, image, mask)
+        view, starts = self.tracker.predict(state, frame, image, mask)
+        found = self.tracker.find(state, view, frame, image, starts)
         usual = not (found.lost or is_high_loss(found.fit, state.baseline, found.view.mask_weight))
         reliable = usual or (not found.lost and found.evidence.is_decisive)
         is_keyframe = reliable and needs_keyframe(state.object_map, found, options)

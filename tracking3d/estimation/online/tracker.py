@@ -43,10 +43,10 @@ class Tracker:
     observer: Observer  # how a frame becomes an observation
     weights: PoseWeights  # of a pose's cost terms
 
-    def track(
+    def predict(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> PoseCandidate:
-        """The pose in the frame after the state's last one.
+    ) -> tuple[Keyframe, dict[str, Pose]]:
+        """The frame after the state's last one, seen from the likeliest of the predicted poses; and all of these.
 
         Args:
             state: After the frame before.
@@ -57,8 +57,7 @@ class Tracker:
         starts = pose_predictions(state, frame.index, mask)
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
-        view = view_frame(self.observer, state, frame, mask, likeliest, followed)
-        return self.find(state, view, frame, image, starts)
+        return view_frame(self.observer, state, frame, mask, likeliest, followed), starts
 
     def find(
         self,

@@ -29,7 +29,7 @@ from tracking3d.geometry.similarity import Similarity
 from tracking3d.pipeline.components import build_encoder
 from tracking3d.pipeline.frame_reading import FrameOrder
 from tracking3d.pipeline.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
-from tracking3d.pipeline.passes import run_passes
+from tracking3d.pipeline.passes import run_refinement, running
 from tracking3d.pipeline.record import RecordOptions, begin_recording
 from tracking3d.pipeline.refinement_steps import Decision, PrecomputedRefinement, RefinementSteps
 from tracking3d.pipeline.session import Session
@@ -182,7 +182,8 @@ def end(tell: Tell, ending: Ending) -> None:
         recording = begin_recording(opened, 0, video.folder, options, writers)
         if recording is not None:
             recording.precomputed = ending.precomputed
-            run_passes(opened.source, opened.frames, [recording], tell)
+            with running(opened.source, [recording], tell) as active:  # every frame has its causal estimate
+                run_refinement(opened.source, active)
     if recording is not None:
         make_final_shape(video.folder, config, opened.source)
     apply_object_size(video.folder, config.object)

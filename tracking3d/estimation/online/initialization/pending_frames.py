@@ -26,7 +26,6 @@ from tracking3d.estimation.online.features.sift import detect, match
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     initialize_without_points,
-    restart_without_points,
     solve_start,
     with_contrast,
 )
@@ -34,7 +33,6 @@ from tracking3d.estimation.online.initialization.structure_from_motion import im
 from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses
 from tracking3d.estimation.online.mapping.local_mapping import tracks_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
-from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import MOST_WAITING, SolverState, thin_out
 
@@ -65,8 +63,6 @@ _MIN_OUTLINE_CHANGE, _MIN_SHADING_CHANGE = 0.05, 0.004  # see `ImageChange`; the
 _MIN_LEAD, _MIN_LEAD_AGAIN = 0.04, 0.02
 _DECISIVE_MOTION = 0.3  # deformation from which more motion decides nothing
 _WELL_TRACKED = 0.25  # bundle cost of points that are tracked well
-_LASTING_MISFIT = 5  # frames in a row, see `is_misfit` (chosen)
-_MOST_RESTARTS = 2  # while frames come; once more after the last one
 _MIN_OVERLAP = 0.7  # IoU with the masks, below which a map without points is not accepted (chosen)
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
@@ -252,35 +248,6 @@ def _refuse(state: SolverState, views: list[Keyframe]) -> SolverState:
     """The state after a map without points that misses its masks: later frames may show more of the shape."""
     later = views[min(_RETRY_INTERVAL, len(views) - 1)].index
     return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0)
-
-
-def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
-    """The state before the next frame, its map restarted if that has explained the last frames badly for long.
-
-    It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
-    """
-    known = state.object_map.fixed_keyframes > 0
-    if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
-        return state
-    restarts = state.restarts + 1
-    again = state.revisable if restarts < _MOST_RESTARTS else ()
-    state = replace(state, misfits=0, restarts=restarts, revisable=again)
-    weights = FitWeights(smoothness=config.smoothness)
-    object_map = restart_without_points(state.object_map, state.camera, weights)
-    if object_map is state.object_map:
-        return state
-    last = object_map.keyframes[-1]
-    return state.with_map(
-        object_map,
-        last_pose=(last.pose, last.index),
-        previous_pose=None,
-        trajectory=((last.pose, last.index),),
-        baseline=LossBaseline(),
-        lost_frames=0,
-        doubtful_frames=0,
-        last_candidate=None,
-        motion_references=(),
-    )
 
 
 def _set_aside(state: SolverState, first: int) -> SolverState:
