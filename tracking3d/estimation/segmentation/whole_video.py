@@ -333,10 +333,10 @@ class PixelEvidence:
         """Ask all of them.
 
         Args:
-            scene: The frame. hulls: ``(2, S, S)`` from
-            `tracking3d.estimation.segmentation.soft_visual_hull.SoftVisualHull.drawn`, or None. colours: What all
-            frames that are trusted show, or None. motion: From
-            `tracking3d.estimation.segmentation.motion_cue.motion_cue`.
+            scene: The frame.
+            hulls: ``(2, S, S)`` from `soft_visual_hull.SoftVisualHull.drawn`, or None.
+            colours: What all frames that are trusted show, or None.
+            motion: From `motion_cue.motion_cue`.
         """
         lab = scene.lab
         masks = {"initial": scene.initial, "answer": scene.mask}

@@ -151,10 +151,12 @@ def make_prompt(
         frame: The frame that is prompted.
         box: ``(x, y, width, height)`` in pixels. If it reaches a few pixels beyond the frame, the part outside is cut
             off, with a warning in the log.
-        mask: ``(H, W)``, or its image file; the object is where it is not zero (in a file: above half). points: ``(N,
-        3)``: x, y in pixels, and 1 on the object or 0 on the background; see `tracking3d.trackers.prompts.points`.
-        box_name: Name of the box in messages, see `tracking3d.errors.argument`. mask_name: Name of the mask.
-        points_name: Name of the points. box_format: How the user wrote the box; messages write it in the same way.
+        mask: ``(H, W)``, or its image file; the object is where it is not zero (in a file: above half).
+        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background; see `prompts.points`.
+        box_name: Name of the box in messages, see `tracking3d.errors.argument`.
+        mask_name: Name of the mask.
+        points_name: Name of the points.
+        box_format: How the user wrote the box; messages write it in the same way.
 
     Raises:
         InputError: None or more than one are given, the box has no size, lies outside the frame or reaches far beyond
