@@ -16,7 +16,7 @@ from tracking3d import Frame, Session, load_config
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.atlas import match_landmarks, merge, transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.frames import Prompt
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.similarity import Similarity
@@ -43,7 +43,7 @@ TURN = Similarity(Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), 1.7, np.ar
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[SolverState, dict[int, np.ndarray]]:
+def solved() -> tuple[Mapped, dict[int, np.ndarray]]:
     """What the solver knows after a short clip, and its answers."""
     clip = synthesize(SyntheticSpec(frames=9, size=(96, 80), supersample=1, degrees_per_frame=5))
     config = settings()
@@ -54,7 +54,7 @@ def solved() -> tuple[SolverState, dict[int, np.ndarray]]:
         for answer in (*estimate.revised, estimate):
             poses[answer.index] = answer.T_cam_obj
     state = session.state_dict()["solver"]
-    assert state.pending is None
+    assert isinstance(state, Mapped)
     return state, poses
 
 
@@ -66,7 +66,7 @@ def settings():
     )  # fmt: skip
 
 
-def seen_otherwise(state: SolverState, similarity: Similarity) -> SolverState:
+def seen_otherwise(state: Mapped, similarity: Similarity) -> Mapped:
     """The same knowledge as another run would have it: other coordinates, other names of landmarks."""
     known = transform_map(state.object_map, inverse(similarity))
     order = np.random.default_rng(0).permutation(len(known.landmarks))

@@ -115,10 +115,7 @@ def first_pass(
 ) -> Generator[tuple[ObjectRecorder, Frame | SkippedFrame, Frame | SkippedFrame | None]]:
     """Each frame, for each recording, with the frame after it; none if no recording needs them.
 
-    Args:
-        source: The source of the frames.
-        frames: Its frames, begun already.
-        active: The recordings. When it ends, what they write in other threads is written.
+    When it ends, what the recordings write in other threads is written.
     """
     objects = len(active)
     waits = any(one.needs_first_pass for one in active)

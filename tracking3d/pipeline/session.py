@@ -308,13 +308,7 @@ class Session(SessionRefinement):
         return with_initial_mask(estimate) if self.config.object.trust_masks else estimate
 
     def _remember(self, frame: Frame, estimate: FrameEstimate, corrected: bool) -> FrameEstimate:
-        """Keep what the next frames need of an estimate, and tell the mask tracker; failures are noted in it.
-
-        Args:
-            frame: The frame.
-            estimate: Its estimate.
-            corrected: Whether the mask tracker was re-anchored in this frame, and stays as it is.
-        """
+        """Keep what later frames need, and feed back to the mask tracker unless this frame ``corrected`` it."""
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
         for one in (*estimate.revised, estimate):
             self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose

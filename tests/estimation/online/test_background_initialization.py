@@ -16,7 +16,7 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.pending_frames import try_initialize
-from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import Initializing, Mapped, SolverState
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.pipeline.session import Session
 from tracking3d.runtime.background_attempt import BackgroundAttempt
@@ -78,7 +78,7 @@ def test_it_is_a_solver_for_live_sources():
 
 def test_frames_keep_their_initial_masks_while_the_map_is_computed(held):
     state, estimates = begun_run(9)
-    assert state.phase is SolverPhase.INITIALIZING and state.background is not None
+    assert isinstance(state, Initializing) and state.background is not None
     for estimate in estimates[1:]:
         assert estimate.status is Status.UNCERTAIN and not estimate.revised
         np.testing.assert_array_equal(estimate.mask, true_mask(estimate.index))
@@ -92,7 +92,7 @@ def test_the_solver_goes_on_with_the_map_when_it_has_caught_up(held):
     held.set()
     assert begun.is_done(PATIENCE)
     state, estimates = take(range(9, FRAMES), (state, estimates))
-    assert state.phase is SolverPhase.TRACKING and state.background is None
+    assert isinstance(state, Mapped) and not state.lost
     adopted = estimates[9]
     known = [*(one.index for one in adopted.revised), adopted.index]
     assert known == sorted(set(known)) and known[0] == 0 and known[-1] == 9
@@ -109,7 +109,7 @@ def test_the_end_waits_for_the_map(held):
     assert found is not None
     known = [*(one.index for one in found.revised), found.index]
     assert known == sorted(set(known)) and (known[0], known[-1]) == (0, 8)
-    assert finished.phase is SolverPhase.TRACKING and finished.background is None
+    assert isinstance(finished, Mapped) and not finished.lost
     assert len(finished.object_map.keyframes) > 1
     assert finished.last_pose[1] == 8
     assert solver().finish_background_work(finished) == (finished, None)
@@ -121,14 +121,14 @@ def test_nothing_is_kept_of_a_quick_attempt_that_finds_nothing(monkeypatch):
     def find_nothing(
         state: SolverState, config: OnlineConfig, ended: bool = False
     ) -> tuple[SolverState, InitialMap | None]:
-        asked.append(len(state.pending or ()))
+        asked.append(len(state.pending))
         return replace(state, waiting_reason="for a reason", next_attempt=0.5), None
 
     monkeypatch.setattr(initializer, "try_initialize", find_nothing)
     monkeypatch.setattr(initializer, "_FIRST_WAIT", PATIENCE)
     state, estimates = take(range(4))
     assert asked == [2, 3, 4]
-    assert state.background is None and len(state.pending or ()) == 4
+    assert state.background is None and len(state.pending) == 4
     assert state.next_attempt == 0.5 and estimates[-1].reason == "for a reason"
 
 
@@ -139,7 +139,6 @@ def test_frames_that_come_during_an_attempt_in_vain_are_kept(monkeypatch):
         state: SolverState, config: OnlineConfig, ended: bool = False
     ) -> tuple[SolverState, InitialMap | None]:
         assert released.wait(PATIENCE)
-        assert state.pending is not None
         return replace(state, pending=state.pending[1:]), None
 
     monkeypatch.setattr(initializer, "try_initialize", find_nothing_late)
@@ -149,7 +148,7 @@ def test_frames_that_come_during_an_attempt_in_vain_are_kept(monkeypatch):
     released.set()
     assert begun.is_done(PATIENCE)
     state, _ = take(range(5, 6), (state, estimates))
-    waiting = [view.index for view, _ in state.pending or ()]
+    waiting = [view.index for view, _ in state.pending]
     assert waiting == [1, 2, 3, 4, 5], "the first frame was given up by the attempt"
 
 

@@ -18,7 +18,7 @@ from tracking3d.estimation.online import mapper
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapper import fix_depth_reversal
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.estimation.segmentation.online_motion_cue import MotionReference
 from tracking3d.geometry.pose import pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import reversal_of
@@ -153,9 +153,8 @@ def wrong_way_round(object_map: ObjectMap) -> ObjectMap:
     )
 
 
-def believed(object_map: ObjectMap) -> SolverState:
+def believed(object_map: ObjectMap) -> Mapped:
     last = object_map.keyframes[-1].pose, object_map.keyframes[-1].index
     picture = np.zeros((SIZE, SIZE), np.uint8)
-    return SolverState(
-        CAMERA, object_map, None, last, None, picture, FollowedPoints.none(), trajectory=(last,)
-    )
+    points, surface = FollowedPoints.none(), object_map.surface()
+    return Mapped(CAMERA, object_map, last, picture, points, surface=surface, trajectory=(last,))

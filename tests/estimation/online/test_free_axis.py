@@ -20,7 +20,7 @@ from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
@@ -170,12 +170,12 @@ def test_an_untwisted_pose_shows_the_same_and_does_not_turn_about_the_axis() -> 
 def test_the_solver_asks_at_due_keyframes_of_maps_without_points_and_its_state_can_be_kept(tmp_path) -> None:
     plain = tumbling()
     last = plain.keyframes[-1]
-    state = SolverState(
-        CAMERA, plain, plain.surface(), (last.pose, last.index), (last.pose, 0), np.zeros((SIZE, SIZE), np.uint8),
-        FollowedPoints.none(), pending=None,
+    state = Mapped(
+        CAMERA, plain, (last.pose, last.index), np.zeros((SIZE, SIZE), np.uint8), FollowedPoints.none(),
+        surface=plain.surface(), previous_pose=(last.pose, 0),
     )  # fmt: skip
 
-    def asked(state: SolverState) -> SolverState:
+    def asked(state: Mapped) -> Mapped:
         return adopt_free_axis(state, OnlineConfig())
 
     with_points = replace(state, object_map=replace(plain, pointless=False))

@@ -23,7 +23,7 @@ from tracking3d.estimation.online.initialization.pending_frames import (
     why_no_map,
 )
 from tracking3d.estimation.online.masks import initial_estimate
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Initializing, Mapped
 from tracking3d.frames import Frame
 
 CONFIG = OnlineConfig()
@@ -53,7 +53,7 @@ def asked(monkeypatch):
     return calls
 
 
-def belief_of(angles, without_mask=()) -> SolverState:
+def belief_of(angles, without_mask=()) -> Initializing:
     """Frames of the turned solid that wait."""
     object_map = map_with_points(angles)
     held = []
@@ -64,7 +64,8 @@ def belief_of(angles, without_mask=()) -> SolverState:
         held.append((view, initial_estimate(frame, view.mask, view.pose, CAMERA)))
     nothing = replace(object_map, keyframes=())
     grey = np.zeros((SIZE, SIZE), np.uint8)
-    return SolverState(CAMERA, nothing, None, (turned(0), 0), None, grey, FollowedPoints.none(), tuple(held))
+    last, points = (turned(0), 0), FollowedPoints.none()
+    return Initializing(CAMERA, nothing, last, grey, points, pending=tuple(held))
 
 
 def test_an_object_that_turns_is_solved(asked):
@@ -84,7 +85,7 @@ def test_without_motion_nothing_is_tried(asked):
     assert not asked["points"]
 
 
-def strangers(state: SolverState) -> SolverState:
+def strangers(state: Initializing) -> Initializing:
     """No point of a frame is found in another one."""
     held = []
     for number, (view, estimate) in enumerate(state.pending):
@@ -191,10 +192,9 @@ def test_an_object_that_was_still_for_long_rests_and_one_that_has_gone_does_not(
 def test_points_that_stand_still_refute_a_rotation_whatever_else_changes(asked, monkeypatch):
     """A hand that comes, or light, changes the pixels of a thing that stands on a table."""
     monkeypatch.setattr(pending_frames, "_last_still_view", lambda views: 0)
-    state, start = try_initialize(belief_of([0.0] * 41), CONFIG)
+    _, start = try_initialize(belief_of([0.0] * 41), CONFIG)
     assert start is None
     assert not asked["turning"]
-    assert state.pending is not None
 
 
 def test_points_that_are_gone_without_having_moved_tell_no_shape(asked):
@@ -338,7 +338,11 @@ def test_a_map_that_explains_frames_badly_for_long_is_begun_again_twice_at_most(
     object_map = replace(turned_map([0.0, 10.0, 20.0]), pointless=True)
     better = replace(object_map, keyframes=object_map.keyframes[:2])
     monkeypatch.setattr(initializer, "restart_without_points", lambda *_: better)
-    state = replace(belief_of(STEADY), pending=None, object_map=object_map, misfits=4, lost_frames=2)
+    last, points = (turned(0), 0), FollowedPoints.none()
+    state = Mapped(
+        CAMERA, object_map, last, np.zeros((SIZE, SIZE), np.uint8), points,
+        surface=object_map.surface(), misfits=4, lost_frames=2,
+    )  # fmt: skip
     assert initializer.restart_if_misfit(state, CONFIG) is state
     state = initializer.restart_if_misfit(replace(state, misfits=5), CONFIG)
     assert state.object_map is better

@@ -10,7 +10,6 @@ import torch
 from rendered_solids import pose_of
 
 from tracking3d.estimation.online.pose_tracking import is_consistent_with_motion, pose_predictions
-from tracking3d.estimation.online.state.solver_state import SolverPhase
 from tracking3d.geometry.camera import Camera
 
 
@@ -25,7 +24,7 @@ def lost(frames: int, step: float = 5.0):
         previous_pose=None,
         camera=camera,
         last_candidate=None,
-        phase=SolverPhase.LOST if frames else SolverPhase.TRACKING,
+        lost=frames > 0,
     )
 
 
@@ -45,7 +44,7 @@ def test_a_long_loss_leads_nowhere():
 
 def test_without_any_motion_nothing_is_led_to():
     assert not is_consistent_with_motion(
-        SimpleNamespace(trajectory=(), lost_frames=1, phase=SolverPhase.LOST), pose_of(0), 1
+        SimpleNamespace(trajectory=(), lost_frames=1, lost=True), pose_of(0), 1
     )
 
 

@@ -32,7 +32,7 @@ from tracking3d.estimation.online.pose_tracking import extrapolate_motion, pixel
 from tracking3d.estimation.online.relocalization import poses_from_matches
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import InactiveMap, Mapped
 from tracking3d.estimation.segmentation import as_lab
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.geometry.camera import Camera
@@ -47,7 +47,7 @@ _UNALIGNED_REASON = (
 )
 
 
-def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
+def guess_alignment(state: Mapped, begun: Mapped) -> Similarity:
     """The guessed similarity from a new map to a lost one: equal size, and the rotation extrapolated over the gap.
 
     Args:
@@ -82,7 +82,7 @@ def _size(object_map: ObjectMap) -> float:
     return float(np.median(seen)) if seen else 1.0
 
 
-def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -> SolverState:
+def switch_map(state: Mapped, begun: Mapped, similarity: Similarity) -> Mapped:
     """The state that continues with the map of a second initialization; the map before it becomes inactive.
 
     Args:
@@ -107,9 +107,8 @@ def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -
     )
 
 
-def _deactivate(state: SolverState, spans: tuple[tuple[int, int], ...]) -> InactiveMap:
+def _deactivate(state: Mapped, spans: tuple[tuple[int, int], ...]) -> InactiveMap:
     """The active map as an inactive one."""
-    assert state.surface is not None
     return InactiveMap(
         state.object_map, state.surface, state.baseline, spans, state.unaligned, state.mask_agreement
     )
@@ -144,7 +143,7 @@ def mark_unaligned(estimate: FrameEstimate) -> FrameEstimate:
     )
 
 
-def activate_map(state: SolverState, other: InactiveMap, index: int) -> SolverState:
+def activate_map(state: Mapped, other: InactiveMap, index: int) -> Mapped:
     """The state that continues from frame ``index`` with an inactive map; the object is still lost."""
     return replace(
         _with_active_map(state, other, (*state.spans, (state.active_since, index - 1))),
@@ -154,7 +153,7 @@ def activate_map(state: SolverState, other: InactiveMap, index: int) -> SolverSt
     )
 
 
-def map_of_frame(state: SolverState, index: int) -> SolverState:
+def map_of_frame(state: Mapped, index: int) -> Mapped:
     """The state after its last frame, with the map active that estimated frame ``index``."""
     if any(first <= index <= last for first, last in state.spans):
         return state
@@ -164,12 +163,12 @@ def map_of_frame(state: SolverState, index: int) -> SolverState:
     return state
 
 
-def frames_of_map(state: SolverState, frames: Iterable[int]) -> Iterator[int]:
+def frames_of_map(state: Mapped, frames: Iterable[int]) -> Iterator[int]:
     """Those of some frames that were estimated with the active map."""
     return (index for index in frames if any(first <= index <= last for first, last in state.spans))
 
 
-def activate_largest_map(state: SolverState) -> SolverState:
+def activate_largest_map(state: Mapped) -> Mapped:
     """The state with the map of most keyframes active, the earlier one of equals; the mesh is made from it."""
 
     def rank(object_map: ObjectMap, since: int) -> tuple[int, int]:
@@ -196,9 +195,7 @@ def refine_inactive_map(
     return replace(other, object_map=object_map, surface=object_map.surface(), unaligned=True)
 
 
-def _with_active_map(
-    state: SolverState, other: InactiveMap, spans: tuple[tuple[int, int], ...]
-) -> SolverState:
+def _with_active_map(state: Mapped, other: InactiveMap, spans: tuple[tuple[int, int], ...]) -> Mapped:
     """The state with another map active; the active one, which estimated ``spans``, becomes inactive."""
     newest = other.object_map.keyframes[-1]
     return replace(
@@ -224,7 +221,7 @@ _MAX_COMPARED = 24  # most keyframes of another map that a keyframe is compared 
 _MAX_COST_RATIO = 1.2  # ratio of the keyframe costs up to which two maps are merged
 
 
-def merge_maps(state: SolverState, config: OnlineConfig, views: tuple[Keyframe, ...]) -> SolverState:
+def merge_maps(state: Mapped, config: OnlineConfig, views: tuple[Keyframe, ...]) -> Mapped:
     """The state after merging the active map with every map that some of its keyframes can be aligned to.
 
     Args:
@@ -277,7 +274,7 @@ def _estimate_alignment(
 
 
 def _merge_pair(
-    state: SolverState, other: ObjectMap, similarity: Similarity, config: OnlineConfig
+    state: Mapped, other: ObjectMap, similarity: Similarity, config: OnlineConfig
 ) -> ObjectMap | None:
     """Both maps as one, if that explains their keyframes nearly as well as two maps do."""
     camera, second = state.camera, transform_map(state.object_map, similarity)
@@ -293,8 +290,8 @@ def _merge_pair(
 
 
 def _with_merged_map(
-    state: SolverState, other: InactiveMap, similarity: Similarity, object_map: ObjectMap
-) -> SolverState:
+    state: Mapped, other: InactiveMap, similarity: Similarity, object_map: ObjectMap
+) -> Mapped:
     newest = object_map.keyframes[-1]
     at_newest = newest.index == state.last_pose[1]
     points = newest.points.spread_out(MOST_FOLLOWED, float(newest.observation.window.side))
@@ -416,7 +413,7 @@ _MIN_MASK_IOU = 0.3  # IoU of two frames' masks, below which they show different
 _MIN_COLOUR_RATIO = -0.5  # mean log ratio of the colours, below which a mask shows another object
 
 
-def needs_second_map(state: SolverState, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> bool:
+def needs_second_map(state: Mapped, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> bool:
     """Whether a second map is begun, or continued, after a frame.
 
     It is if the object is lost. A map without points is given up if its poses have been doubtful for long, too, but
@@ -430,8 +427,8 @@ def needs_second_map(state: SolverState, image: NDArray[np.uint8], mask: NDArray
     if state.object_map.fixed_keyframes:
         return False
     if not state.object_map.pointless:
-        return state.phase is SolverPhase.LOST
-    doubted = state.phase is SolverPhase.LOST or state.doubtful_frames >= _LASTING_DOUBT
+        return state.lost
+    doubted = state.lost or state.doubtful_frames >= _LASTING_DOUBT
     return doubted and texture_strength(image, mask) >= PLAIN
 
 
@@ -449,7 +446,7 @@ def is_fully_visible(mask: NDArray[np.bool_]) -> bool:
     return bool(mask.any() and not border.any())
 
 
-def colours_match(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> bool:
+def colours_match(state: Mapped, frame: Frame, mask: NDArray[np.bool_]) -> bool:
     """Whether the colours inside a mask ``(H, W)`` do not contradict the object's colour model."""
     if state.colours is None:
         return True
@@ -459,6 +456,6 @@ def colours_match(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> 
     return float(ratio[mask[crop]].mean()) > _MIN_COLOUR_RATIO
 
 
-def is_reliable(begun: SolverState, estimate: FrameEstimate) -> bool:
+def is_reliable(begun: Mapped, estimate: FrameEstimate) -> bool:
     """Whether a second initialization is reliable enough to continue with."""
     return not begun.object_map.pointless and estimate.confidence >= TRACKED_CONFIDENCE

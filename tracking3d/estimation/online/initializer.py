@@ -67,7 +67,7 @@ from tracking3d.estimation.online.state.confidence import (
     assess_pose,
 )
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import Initializing, Mapped, SolverState
 from tracking3d.estimation.shape import Shape, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.solver import PhotoEstimates, PhotoSet
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
@@ -102,7 +102,7 @@ class Initializer:
 
     def begin(
         self, frame: Frame, mask: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
-    ) -> tuple[SolverState, FrameEstimate]:
+    ) -> tuple[Initializing, FrameEstimate]:
         """The state after a first frame.
 
         Args:
@@ -126,7 +126,6 @@ class Initializer:
             renderer=config.runtime.renderer,
         )
         image = grey(frame.image)
-        state = SolverState(camera, object_map, None, (pose, frame.index), None, image, FollowedPoints.none())
         observation = observer.observe(frame, mask, pose, object_map.vertices, camera, None)
         if space is None:
             channels = feature_channels(observer.encoder, config.object.texture_channels)
@@ -136,17 +135,12 @@ class Initializer:
         view = Keyframe(observation, mask, pose, FollowedPoints.none(), image=window)
         object_map, view = insert_points(object_map, camera, view, image)
         estimate = initial_estimate(frame, mask, pose, camera)
-        state = replace(
-            state,
-            object_map=object_map,
-            feature_space=space,
-            tracked_points=view.points,
-            pending=((view, estimate),),
-        )
-        return state, estimate
+        last = pose, frame.index
+        pending = ((view, estimate),)
+        return Initializing(camera, object_map, last, image, view.points, space, pending=pending), estimate
 
     def add(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+        self, state: Initializing, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[SolverState, FrameEstimate]:
         """Add a frame to the pending ones, and make the first map if they show enough motion.
 
@@ -156,7 +150,6 @@ class Initializer:
             image: ``(H, W)`` grey.
             mask: ``(H, W)`` its initial mask, or None.
         """
-        assert state.pending is not None
         pose = state.last_pose[0]
         followed = follow(state.grey, image, state.tracked_points)
         view = view_frame(self.observer, state, frame, mask, pose, followed)
@@ -164,15 +157,19 @@ class Initializer:
             state.object_map, tuple(v for v, _ in state.pending), view, image
         )
         estimate = initial_estimate(frame, mask, pose, state.camera)
-        state = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
-        state = state.advanced(pose, frame.index, image, view.points)
-        attempt = self._try_in_background if self.in_background else self._try
-        state, found = attempt(state)
-        return state, replace(
-            estimate, reason=state.waiting_reason or estimate.reason
-        ) if found is None else found
+        state = replace(
+            state,
+            object_map=object_map,
+            pending=(*state.pending, (view, estimate)),
+            last_pose=(pose, frame.index),
+            grey=image,
+            tracked_points=view.points,
+        )
+        updated, found = (self._try_in_background if self.in_background else self._try)(state)
+        why = updated.waiting_reason if isinstance(updated, Initializing) else ""
+        return updated, found or replace(estimate, reason=why or estimate.reason)
 
-    def finish(self, state: SolverState) -> SolverState:
+    def finish(self, state: Initializing) -> SolverState:
         """The state after the last frame, with a first map if the pending frames determine one."""
         state, start = try_initialize(state, self.options, ended=True)
         if start is None:
@@ -181,12 +178,11 @@ class Initializer:
 
     def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
         """See `tracking3d.estimation.solver.RefiningSolver`; an attempt that has failed is given up."""
-        begun = state.background
-        if begun is None or not begun.is_done(wait=None):
+        if isinstance(state, Mapped) or (begun := state.background) is None or not begun.is_done(wait=None):
             return state, None
         return (replace(state, background=None), None) if begun.has_failed else self._adopt(state, begun)
 
-    def restart_if_misfit(self, state: SolverState) -> tuple[SolverState, tuple[FrameEstimate, ...]]:
+    def restart_if_misfit(self, state: Mapped) -> tuple[Mapped, tuple[FrameEstimate, ...]]:
         """The state before the next frame, and new estimates of earlier ones if its map is restarted.
 
         See `restart_if_misfit`. A live source would wait for seconds, so there it stays.
@@ -202,7 +198,7 @@ class Initializer:
 
     def has_points(self, state: SolverState, ended: bool) -> bool:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
-        if state.phase is SolverPhase.INITIALIZING:
+        if isinstance(state, Initializing):
             start = try_initialize(state, self.options, ended=True)[1] if ended else None
             return start is not None and not start.object_map.pointless
         maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
@@ -213,7 +209,7 @@ class Initializer:
         camera = self.observer.camera
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
-        begun: SolverState | None = None
+        begun: Initializing | None = None
         found, waiting = list[Photo](), list[Pending]()
         for frame, mask in photos.read(chosen):
             frame, binary = mask.on(frame), mask.found
@@ -229,42 +225,47 @@ class Initializer:
             found.append(Photo.of(frame.index, grey(frame.image), binary))
         start = start_of_photos(found, camera)
         if begun is None or start.structure is None:
-            return replace(state, waiting_reason=start.reason), PhotoEstimates((), start.reason)
+            if isinstance(state, Initializing):
+                state = replace(state, waiting_reason=start.reason)
+            return state, PhotoEstimates((), start.reason)
         weights = FitWeights(smoothness=self.options.smoothness)
         views = [view for view, _ in waiting]
         made, shown = initial_map_of_photos(begun.object_map, start, found, views, camera, weights)
         pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
-        begun, last = self._make_map(replace(begun, pending=pending), made)
+        joined, last = self._make_map(replace(begun, pending=pending), made)
         estimates = [*last.revised, replace(last, revised=())]
         rest = sorted(set(photos.indices) - set(chosen))
-        estimates += [_find_photo(begun, frame, mask) for frame, mask in (photos.read(rest) if rest else ())]
-        return begun, PhotoEstimates(tuple(estimates), start.reason)
+        estimates += [_find_photo(joined, frame, mask) for frame, mask in (photos.read(rest) if rest else ())]
+        return joined, PhotoEstimates(tuple(estimates), start.reason)
 
-    def _try(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+    def _try(self, state: Initializing) -> tuple[SolverState, FrameEstimate | None]:
         """Make the first map if the pending frames determine it; None if they do not."""
         with in_stage("map"):
             state, start = try_initialize(state, self.options)
         return (state, None) if start is None else self._make_map(state, start)
 
-    def _make_map(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
+    def _make_map(self, state: Initializing, start: InitialMap) -> tuple[Mapped, FrameEstimate]:
         """Make the first map, and estimate all pending frames with it."""
         if start.object_map.pointless and state.feature_space is not None:
             space = state.feature_space.with_contrast()
             state = replace(state, feature_space=space)
             views = tuple(with_contrast(view, space) for view in start.object_map.keyframes)
             start = replace(start, object_map=replace(start.object_map, keyframes=views))
-        assert state.pending is not None
         everything = list(range(len(start.object_map.keyframes)))
         waiting, before, camera = (*state.rested, *state.pending), state.camera, start.camera
         with in_stage("map"):
             object_map = refine_local_map(
                 start.object_map, camera, everything, self.options, bundle_iterations=20, rounds=3
             )
-            updated = state.with_map(
+            updated = Mapped(
+                camera,
                 object_map,
-                camera=camera,
-                pending=None,
-                rested=(),
+                state.last_pose,
+                state.grey,
+                state.tracked_points,
+                state.feature_space,
+                state.extended,
+                surface=object_map.surface(),
                 revisable=waiting if start.object_map.pointless and not self.in_background else (),
             )
             updated = refine_by_landmarks(updated, self.options)
@@ -276,9 +277,8 @@ class Initializer:
             estimate = replace(estimate, reason=_LOOKS_FLAT)
         return updated, estimate
 
-    def _try_in_background(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
+    def _try_in_background(self, state: Initializing) -> tuple[SolverState, FrameEstimate | None]:
         """Make the first map in another thread; the newest frame keeps its initial mask until that is done."""
-        assert state.pending is not None
         begun, newest, wait = state.background, state.pending[-1], 0.0
         if begun is None:
 
@@ -289,6 +289,7 @@ class Initializer:
             def arrived(
                 made: SolverState, frames: Sequence[Pending]
             ) -> tuple[SolverState, list[FrameEstimate]]:
+                assert isinstance(made, Mapped)  # there are estimates
                 return self._estimate_arrived(made, frames, state.camera)
 
             begun, wait = BackgroundAttempt(attempt, arrived), _FIRST_WAIT
@@ -299,34 +300,29 @@ class Initializer:
         return replace(state, background=begun), replace(newest[1], reason=_IN_PROGRESS)
 
     def _adopt(
-        self, state: SolverState, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
+        self, state: Initializing, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
     ) -> tuple[SolverState, FrameEstimate | None]:
         """The state with what came of an initialization, as if no frame had come meanwhile."""
         outcome = begun.outcome()
         found, estimates = outcome.state, outcome.results
-        if not estimates:
-            assert found.pending is not None
+        if isinstance(found, Initializing):
             at_rest = found.object_map.started_at_rest
             return replace(
-                state,
+                found,
                 object_map=replace(state.object_map, started_at_rest=at_rest),
+                last_pose=state.last_pose,
+                grey=state.grey,
+                tracked_points=state.tracked_points,
                 pending=(*found.pending, *outcome.left),
-                rested=found.rested,
-                next_attempt=found.next_attempt,
-                ambiguous_frames=found.ambiguous_frames,
-                ambiguous_rotation=found.ambiguous_rotation,
-                waiting_reason=found.waiting_reason,
-                background=None,
             ), None
         if outcome.left:
             found, more = self._estimate_arrived(found, outcome.left, state.camera)
             estimates = [*estimates, *more]
-        found = replace(found, grey=state.grey, background=None)
-        return found, replace(estimates[-1], revised=tuple(estimates[:-1]))
+        return replace(found, grey=state.grey), replace(estimates[-1], revised=tuple(estimates[:-1]))
 
     def _estimate_pending(
-        self, state: SolverState, waiting: tuple[Pending, ...], origin: str, before: Camera
-    ) -> tuple[SolverState, list[FrameEstimate]]:
+        self, state: Mapped, waiting: tuple[Pending, ...], origin: str, before: Camera
+    ) -> tuple[Mapped, list[FrameEstimate]]:
         """Estimate all pending frames with the first map, one after the other.
 
         The map may have been made from some of them only. Those before these are estimated backwards in time. Those
@@ -350,8 +346,8 @@ class Initializer:
         return replace(state, previous_pose=trail[-2]), [*backwards[::-1], *revised]
 
     def _estimate_arrived(
-        self, state: SolverState, arrived: Sequence[Pending], before: Camera
-    ) -> tuple[SolverState, list[FrameEstimate]]:
+        self, state: Mapped, arrived: Sequence[Pending], before: Camera
+    ) -> tuple[Mapped, list[FrameEstimate]]:
         """Estimate frames that came while the first map was computed, at least one, in the same way."""
         names = max(int(view.points.landmark.max(initial=-1)) for view, _ in arrived) + 1
         state = replace(state, object_map=_with_room(state.object_map, names), previous_pose=state.last_pose)
@@ -361,13 +357,13 @@ class Initializer:
 
     def _estimate_in_turn(
         self,
-        state: SolverState,
+        state: Mapped,
         waiting: Sequence[Pending],
         known: tuple[Pose, int],
         poses: Mapping[int, Pose],
         origin: str,
         before: Camera,
-    ) -> tuple[SolverState, list[FrameEstimate], list[tuple[Pose, int]]]:
+    ) -> tuple[Mapped, list[FrameEstimate], list[tuple[Pose, int]]]:
         """Estimate frames one after the other, each from the pose of the one before.
 
         Args:
@@ -389,7 +385,6 @@ class Initializer:
                 view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
             if state.feature_space is not None:
                 view = with_contrast(view, state.feature_space)
-            assert state.surface is not None
             starts = {origin: poses.get(view.index, pose)}
             fit = fit_pose(state.object_map, state.surface, view, starts, view.points, weights)[1]
             if view.index == fixed:
@@ -416,7 +411,7 @@ class Initializer:
         ), revised, trail  # fmt: skip
 
 
-def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
+def restart_if_misfit(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state before the next frame, its map restarted if that has explained the last frames badly for long.
 
     It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
@@ -445,7 +440,7 @@ def restart_if_misfit(state: SolverState, config: OnlineConfig) -> SolverState:
     )
 
 
-def _find_photo(state: SolverState, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
+def _find_photo(state: Mapped, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
     """A photo that was not joined, by its matches with the nearest ones that were; lost if there are too few."""
     pose, binary = state.last_pose[0], mask.found
     nearest = sorted(state.object_map.keyframes, key=lambda view: abs(view.index - frame.index))
@@ -469,13 +464,13 @@ def _with_room(object_map: ObjectMap, names: int) -> ObjectMap:
     )
 
 
-def _is_new(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> bool:
+def _is_new(state: Mapped, found: PoseCandidate, config: OnlineConfig) -> bool:
     """Whether a pending frame is to be a keyframe; without points its pose is no better than the outline."""
     points = found.evidence.inliers >= ENOUGH_POINTS and not state.object_map.pointless
     return points and not found.lost and needs_keyframe(state.object_map, found, config)
 
 
-def _with_keyframe(state: SolverState, found: PoseCandidate, config: OnlineConfig) -> SolverState:
+def _with_keyframe(state: Mapped, found: PoseCandidate, config: OnlineConfig) -> Mapped:
     """The map with a pending frame as one more keyframe; the points that were tracked into it become landmarks."""
     view = replace(found.view, pose=found.fit.pose, points=found.points)
     object_map = replace(state.object_map, keyframes=(*state.object_map.keyframes, view))

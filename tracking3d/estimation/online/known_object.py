@@ -37,7 +37,7 @@ from tracking3d.estimation.online.relocalization import (
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped, SolverState
 from tracking3d.estimation.shape import RADIUS, Shape
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.features.protocol import FeatureEncoder
@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class KnownObjectSolver(RefiningSolver[SolverState]):
+class KnownObjectSolver(RefiningSolver[Mapped]):
     """Tracks a known object; estimates are in the object's own coordinates and unit.
 
     Until the object is detected, frames are estimated as lost, and each is searched. From then on it is the online
@@ -75,7 +75,7 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
         """The solver that tracks the object once it is detected."""
         return OnlineSolver(self.config, self.camera, self.encoder)
 
-    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Mapped, FrameEstimate]:
         """Take the first frame.
 
         Raises:
@@ -94,60 +94,61 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
         pose = Pose.identity(
             object_map.vertices.new_tensor([0.0, 0.0, 4 * self.camera.fy / self.camera.height])
         )
-        state = SolverState(
-            self.camera, object_map, object_map.surface(), (pose, frame.index), None, grey(frame.image),
-            FollowedPoints.none(), None, space,
+        state = Mapped(
+            self.camera, object_map, (pose, frame.index), grey(frame.image), FollowedPoints.none(), space,
+            surface=object_map.surface(),
         )  # fmt: skip
         state, estimate = self._detect(state, frame, binary)
         return state, known_object.answered(estimate)
 
-    def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
+    def step(self, state: Mapped, frame: Frame, mask: MaskEstimate) -> tuple[Mapped, FrameEstimate]:
         """Take one more frame."""
         if state.trajectory:
-            state, estimate = self.online.step(state, frame, mask)
+            followed, estimate = self.online.step(state, frame, mask)
+            state = _with_map(followed)
         else:
             state, estimate = self._detect(state, frame, mask.found)
         return state, self.known_object.answered(estimate)
 
-    def refine(self, state: SolverState) -> SolverState:
+    def refine(self, state: Mapped) -> Mapped:
         """See `OnlineSolver.refine`."""
-        return self.online.refine(state)
+        return _with_map(self.online.refine(state))
 
     def refine_frame(
-        self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
-    ) -> tuple[SolverState, FrameEstimate]:
+        self, state: Mapped, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[Mapped, FrameEstimate]:
         """A frame's pose once more, with all that the video has shown."""
         if not state.trajectory:
             estimate = _unseen(initial_estimate(frame, mask.found, state.last_pose[0], state.camera))
             return state, self.known_object.answered(replace(estimate, refined=True))
         causal = self.known_object.to_solver(T_cam_obj)
-        state, estimate = self.online.refine_frame(state, frame, mask, causal)
-        return state, self.known_object.answered(estimate)
+        followed, estimate = self.online.refine_frame(state, frame, mask, causal)
+        return _with_map(followed), self.known_object.answered(estimate)
 
-    def start_from(self, state: SolverState, poses: Mapping[int, NDArray[np.float64]]) -> SolverState:
+    def start_from(self, state: Mapped, poses: Mapping[int, NDArray[np.float64]]) -> Mapped:
         """See `OnlineSolver.start_from`."""
-        return self.online.start_from(state, {at: self.known_object.to_solver(T) for at, T in poses.items()})
+        return replace(state, extended={at: self.known_object.to_solver(T) for at, T in poses.items()})
 
     def restart_backwards(
-        self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
-    ) -> SolverState:
+        self, state: Mapped, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
+    ) -> Mapped:
         """The state that continues from an earlier frame; see `OnlineSolver.restart_backwards`."""
-        turned = self.online.restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
+        T_cam_obj = self.known_object.to_solver(T_cam_obj)
+        turned = _with_map(self.online.restart_backwards(state, frame, number, T_cam_obj))
         return turned if state.trajectory else replace(turned, trajectory=())
 
-    def trust_mask(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> SolverState:
+    def trust_mask(self, state: Mapped, frame: Frame, mask: NDArray[np.bool_]) -> Mapped:
         """See `OnlineSolver.trust_mask`."""
-        return self.online.trust_mask(state, frame, mask)
+        return _with_map(self.online.trust_mask(state, frame, mask))
 
-    def result(self, state: SolverState) -> ObjectModel:
+    def result(self, state: Mapped) -> ObjectModel:
         """The object as it is known."""
-        assert state.surface is not None
         features = state.surface.texture.permute(1, 2, 0).cpu().numpy()
         return replace(self.known_object.model, features=features)
 
     def _detect(
-        self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None
-    ) -> tuple[SolverState, FrameEstimate]:
+        self, state: Mapped, frame: Frame, mask: NDArray[np.bool_] | None
+    ) -> tuple[Mapped, FrameEstimate]:
         """Search for the object in a frame, and initialize with it if it is found."""
         image = grey(frame.image)
         state = self._with_space(state, frame, mask)
@@ -175,7 +176,7 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
         return learn_colours(begun, estimate, found), estimate
 
     def _match_views(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+        self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
         """The object in a frame without any prior; None if no keypoints match."""
         attempts, weights = list[PoseCandidate](), self.online.tracker.weights
@@ -186,7 +187,6 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
                     for pose, points in by_keypoints(state.object_map, state.camera, image, region)
                 ]
         if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):
-            assert state.surface is not None
             nothing, last = FollowedPoints.none(), state.last_pose[0]
             view = view_frame(self.online.observer, state, frame, mask, last, nothing)
             attempts += [
@@ -202,7 +202,7 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
 
     def _attempt(
         self,
-        state: SolverState,
+        state: Mapped,
         frame: Frame,
         mask: NDArray[np.bool_] | None,
         origin: str,
@@ -215,7 +215,7 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
         view = view_frame(self.online.observer, state, frame, mask, pose, points)
         return self.online.tracker.attempt(state, view, origin, guessed=origin == _OUTLINED)
 
-    def _with_space(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None) -> SolverState:
+    def _with_space(self, state: Mapped, frame: Frame, mask: NDArray[np.bool_] | None) -> Mapped:
         """The state with the features of an object whose colours only the first frame with a mask determines."""
         if state.feature_space is not None or mask is None or not mask.any():
             return state
@@ -235,6 +235,12 @@ class KnownObjectSolver(RefiningSolver[SolverState]):
                 self.known_object.name.capitalize(), earlier.fov, earlier.width, earlier.height,
                 self.camera.width, self.camera.height,
             )  # fmt: skip
+
+
+def _with_map(state: SolverState) -> Mapped:
+    """The online solver's state, which has a map: that of a known object does from the first frame on."""
+    assert isinstance(state, Mapped)
+    return state
 
 
 def _is_sure(attempts: list[PoseCandidate]) -> bool:

@@ -25,7 +25,7 @@ from tracking3d.estimation.online.mapping.local_mapping import (
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.confidence import LossBaseline
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import Reversal, Structure, adjust, reversal_of
@@ -51,9 +51,7 @@ _LANDMARK_PRIOR = (
 _SCALE = 1.0  # pixels
 
 
-def insert_frame(
-    state: SolverState, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
-) -> SolverState:
+def insert_frame(state: Mapped, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig) -> Mapped:
     """The state with its last frame as a new keyframe, and the map refined.
 
     Args:
@@ -68,7 +66,7 @@ def insert_frame(
     return refine_by_landmarks(fix_depth_reversal(state, config), config)
 
 
-def adopt_free_axis(state: SolverState, config: OnlineConfig) -> SolverState:
+def adopt_free_axis(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state before the next frame, with a surface of revolution if its keyframes tell that it is one.
 
     It is asked at every fourth keyframe, and takes seconds. Whether the surface still is one is asked every few frames:
@@ -92,7 +90,7 @@ def adopt_free_axis(state: SolverState, config: OnlineConfig) -> SolverState:
     )
 
 
-def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
+def fix_depth_reversal(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state with its depth reversed if that explains the keyframes better, else unchanged."""
     object_map, views = state.object_map, state.object_map.keyframes
     if object_map.fixed_keyframes or object_map.pointless or len(views) < _MIN_KEYFRAMES:

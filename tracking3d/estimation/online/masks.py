@@ -15,7 +15,7 @@ from tracking3d.estimation.online.mapping.local_mapping import viewing_angle
 from tracking3d.estimation.online.optimization.pose_refinement import least_constrained_axis
 from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import MaskAgreement, SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped, MaskAgreement
 from tracking3d.estimation.segmentation import (
     ColourModels,
     as_lab,
@@ -61,7 +61,7 @@ def initial_estimate(
     )
 
 
-def learn_colours(state: SolverState, estimate: FrameEstimate, found: PoseCandidate) -> SolverState:
+def learn_colours(state: Mapped, estimate: FrameEstimate, found: PoseCandidate) -> Mapped:
     """The state with the colour models updated by a reliable frame."""
     if found.doubtful or found.view.mask is None:
         return state
@@ -69,7 +69,7 @@ def learn_colours(state: SolverState, estimate: FrameEstimate, found: PoseCandid
 
 
 def make_estimate(
-    state: SolverState,
+    state: Mapped,
     estimate: FrameEstimate,
     found: PoseCandidate,
     moving: Callable[[], NDArray[np.float32] | None] | None = None,
@@ -132,7 +132,7 @@ _USUAL, _ANOTHER = 0.05, 0.15
 """Share of a mask that may lie beyond the silhouette above the usual one; from the second on it shows another thing."""
 
 
-def measure_mask_agreement(state: SolverState) -> SolverState:
+def measure_mask_agreement(state: Mapped) -> Mapped:
     """The state with the agreement of its keyframes' masks, if there are enough more of these than the last time."""
     measured, count = state.mask_agreement.keyframes, len(state.object_map.keyframes)
     if measured <= count < max(_GROWTH * measured, 1):
@@ -299,7 +299,7 @@ _MIN_INLIERS = 20  # fewest inliers of a pose whose motion is used
 
 
 def motion_cue_in_window(
-    state: SolverState, found: PoseCandidate, image: NDArray[np.uint8]
+    state: Mapped, found: PoseCandidate, image: NDArray[np.uint8]
 ) -> NDArray[np.float32] | None:
     """``(S, S)`` the motion cue in the window of `upsampled_window`; None if it cannot be determined.
 
@@ -343,8 +343,8 @@ def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
 
 
 def remember_motion(
-    state: SolverState, estimate: FrameEstimate, found: PoseCandidate, image: NDArray[np.uint8]
-) -> SolverState:
+    state: Mapped, estimate: FrameEstimate, found: PoseCandidate, image: NDArray[np.uint8]
+) -> Mapped:
     """The state that remembers a reliable frame; after a loss the memory starts empty."""
     if found.lost:
         return replace(state, motion_references=())

@@ -22,7 +22,7 @@ from tracking3d.estimation.online.optimization.pose_refinement import refine_pos
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.confidence import PoseCandidate, PoseEvidence
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, pose_from_arrays, rotation_angle
 from tracking3d.points.landmark_adjustment import resect
@@ -194,7 +194,7 @@ _BRIEF, _NEAR = 5, 30.0
 """Lost frames, and degrees, within which the motion model supports a side that was never seen, as a card's edge."""
 
 
-def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
+def pose_predictions(state: Mapped, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
     """Predicted poses for frame ``index`` by name, the likeliest first.
 
     Args:
@@ -203,7 +203,7 @@ def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | N
         mask: ``(H, W)`` its initial mask, or None; it places an object that was lost.
     """
     last, last_index = state.last_pose
-    if state.phase is SolverPhase.LOST and state.trajectory:
+    if state.lost and state.trajectory:
         starts = {
             "motion_model": extrapolate_motion(state.trajectory, index),
             "last": state.trajectory[-1][0],
@@ -223,7 +223,7 @@ def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | N
     return {"velocity": extrapolate(before, last, min(steps, 3.0)), "last": last}
 
 
-def predict_points(state: SolverState, pose: Pose) -> NDArray[np.float32] | None:
+def predict_points(state: Mapped, pose: Pose) -> NDArray[np.float32] | None:
     """``(N, 2)`` predicted pixels of the tracked points at a pose; None if there are none."""
     if not len(state.tracked_points):
         return None
@@ -232,7 +232,7 @@ def predict_points(state: SolverState, pose: Pose) -> NDArray[np.float32] | None
     return np.asarray(state.tracked_points.pixel + np.nan_to_num(there - here), dtype=np.float32)
 
 
-def is_consistent_with_motion(state: SolverState, pose: Pose, index: int) -> bool:
+def is_consistent_with_motion(state: Mapped, pose: Pose, index: int) -> bool:
     """Whether a pose agrees with the motion before a loss: only for a short loss, and near the extrapolated pose."""
     if not state.trajectory or index - state.trajectory[-1][1] > _BRIEF + 1:
         return False
@@ -240,7 +240,7 @@ def is_consistent_with_motion(state: SolverState, pose: Pose, index: int) -> boo
     return math.degrees(away) < _NEAR
 
 
-def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[np.uint8]) -> SolverState:
+def advance(state: Mapped, found: PoseCandidate, pose: Pose, grey: NDArray[np.uint8]) -> Mapped:
     """The state one frame later, with the counts of lost and doubtful frames updated.
 
     Args:
@@ -251,14 +251,18 @@ def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[
     """
     searched_for = state.lost_frames + 1 if found.view.mask is not None else max(state.lost_frames, 1)
     return replace(
-        state.advanced(pose, found.view.index, grey, found.points),
+        state,
+        last_pose=(pose, found.view.index),
+        previous_pose=state.last_pose,
+        grey=grey,
+        tracked_points=found.points,
         lost_frames=found.lost * searched_for,
         doubtful_frames=found.doubtful * (state.doubtful_frames + 1),
         last_candidate=found.fit.pose if found.lost and found.view.mask is not None else None,
     )
 
 
-def extend_trajectory(state: SolverState, pose: Pose, index: int) -> SolverState:
+def extend_trajectory(state: Mapped, pose: Pose, index: int) -> Mapped:
     """The state with one more tracked frame for the motion model."""
     return replace(state, trajectory=(*state.trajectory, (pose, index))[-TRAJECTORY_LENGTH:])
 

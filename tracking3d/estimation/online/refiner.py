@@ -29,7 +29,7 @@ from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.pose_tracking import extend_trajectory
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import InactiveMap, Initializing, Mapped, SolverState
 from tracking3d.estimation.solver import Gap, ModelCoverage, RefinedStart
 from tracking3d.frames import TRACKED_CONFIDENCE, Frame
 from tracking3d.geometry.camera import Camera
@@ -38,14 +38,14 @@ from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 _ROOM = 1.5
 """Factor by which an extended map may have more keyframes."""
 _NEVER_REVERSED = (1 << 30, 360.0)
-"""A `SolverState.reversal_attempt` after which there is no other: poses of other frames refer to the map as it is."""
+"""A `Mapped.reversal_attempt` after which there is no other: poses of other frames refer to the map as it is."""
 _MOST_BENT = 0.25
 """Distance in radii of the object by which the refined surface may lie elsewhere than the map's, as a median: a surface
 farther off belongs to another map, or was turned inside out by a depth reversal."""
 _BUNDLE_ITERATIONS, _ROUNDS = 15, 2
 
 
-def refine_active_map(state: SolverState, config: OnlineConfig) -> SolverState:
+def refine_active_map(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state for the final estimates, its active map refined with all keyframes and the focal length if assumed."""
     object_map, camera = state.object_map, state.camera
     if object_map.pointless and not object_map.fixed_keyframes:
@@ -62,7 +62,7 @@ def refine_active_map(state: SolverState, config: OnlineConfig) -> SolverState:
     )
 
 
-def _with_final_map(state: SolverState, object_map: ObjectMap, camera: Camera) -> SolverState:
+def _with_final_map(state: Mapped, object_map: ObjectMap, camera: Camera) -> Mapped:
     """The state with a map that frames are estimated with in order of time, the first one next."""
     return state.with_map(
         object_map,
@@ -75,9 +75,9 @@ def _with_final_map(state: SolverState, object_map: ObjectMap, camera: Camera) -
     )
 
 
-def continue_refinement(state: SolverState, start: RefinedStart, config: OnlineConfig) -> SolverState | None:
+def continue_refinement(state: SolverState, start: RefinedStart, config: OnlineConfig) -> Mapped | None:
     """The state with an earlier refinement's surface and poses; None if it has several maps, or another one."""
-    if state.phase is SolverPhase.INITIALIZING or state.inactive_maps or state.unaligned:
+    if isinstance(state, Initializing) or state.inactive_maps or state.unaligned:
         return None
     object_map = move_to_refined(state.object_map, state.camera, start, config)
     if object_map is None:
@@ -88,14 +88,16 @@ def continue_refinement(state: SolverState, start: RefinedStart, config: OnlineC
 
 def keyframe_poses(state: SolverState) -> dict[int, NDArray[np.float64]]:
     """Refined poses ``(4, 4)`` of the keyframes of a map with points, if the causal poses are all of that map."""
+    if isinstance(state, Initializing):
+        return {}
     object_map = state.object_map
     one_map = not (state.inactive_maps or state.extended or object_map.fixed_keyframes)
-    if state.surface is None or object_map.pointless or not one_map:
+    if object_map.pointless or not one_map:
         return {}
     return {view.index: view.pose.matrix().double().cpu().numpy() for view in object_map.keyframes}
 
 
-def keep_frame(state: SolverState, frame: Frame, T_cam_obj: NDArray[np.float64]) -> SolverState:
+def keep_frame(state: Mapped, frame: Frame, T_cam_obj: NDArray[np.float64]) -> Mapped:
     """Take a frame whose refined pose stands, so that its landmarks are followed into the next one."""
     object_map = state.object_map
     pose = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
@@ -211,8 +213,8 @@ def _matrix(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def prepare_extension(
-    state: SolverState, confidence: Mapping[int, float], config: OnlineConfig
-) -> tuple[SolverState, ModelCoverage] | None:
+    state: Mapped, confidence: Mapping[int, float], config: OnlineConfig
+) -> tuple[Mapped, ModelCoverage] | None:
     """The state for an extension of its active map, and what that explains; None if it cannot be extended.
 
     Keyframes that neither an estimate nor enough landmarks support are removed; the others are refined together, and
@@ -241,7 +243,7 @@ def prepare_extension(
     return state, ModelCoverage(confidence, anchors)
 
 
-def end_extension(state: SolverState, found: Collection[int], last: int) -> SolverState:
+def end_extension(state: Mapped, found: Collection[int], last: int) -> Mapped:
     """The state for the final refinement; maps of frames that the largest one explains now are given up.
 
     Args:
@@ -283,7 +285,7 @@ def _inliers(object_map: ObjectMap, view: Keyframe) -> int:
     return int((object_map.sightings[view.points.landmark] >= 2).sum())
 
 
-def enter_gap(state: SolverState, gap: Gap, number: int) -> SolverState:
+def enter_gap(state: Mapped, gap: Gap, number: int) -> Mapped:
     """The state after a gap's anchor, which is numbered ``number``; the nearest keyframes are the latest ones."""
     anchor = gap.anchor.index
     own = next(view for view in state.object_map.keyframes if view.index == anchor)
@@ -311,7 +313,7 @@ def enter_gap(state: SolverState, gap: Gap, number: int) -> SolverState:
     )
 
 
-def leave_gap(state: SolverState, gap: Gap, number: int) -> SolverState:
+def leave_gap(state: Mapped, gap: Gap, number: int) -> Mapped:
     """The state after a gap: keyframes have their frames' own indices, and come in order of time."""
     sign = -1 if gap.backwards else 1
     found = {}

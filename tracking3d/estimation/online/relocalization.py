@@ -30,7 +30,7 @@ from tracking3d.estimation.online.pose_tracking import (
     pose_of_points,
 )
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.rendering import Surface
@@ -82,7 +82,7 @@ Found = tuple[str, PoseFit, FollowedPoints]
 
 
 def relocalize(
-    state: SolverState, view: Keyframe, image: NDArray[np.uint8], best: Found, weights: PoseWeights
+    state: Mapped, view: Keyframe, image: NDArray[np.uint8], best: Found, weights: PoseWeights
 ) -> Found:
     """The best of the candidate so far and the costly hypotheses, by how they re-render the frame.
 
@@ -96,8 +96,7 @@ def relocalize(
         best: The best candidate so far.
         weights: The weights of the cost terms.
     """
-    object_map, surface, camera, lost = state.object_map, state.surface, state.camera, state.lost_frames > 0
-    assert surface is not None
+    object_map, surface, camera, lost = state.object_map, state.surface, state.camera, state.lost
 
     def fitted(name: str, pose: Pose, points: FollowedPoints, asked: FollowedPoints) -> Found:
         _, fit = fit_pose(object_map, surface, view, {name: pose}, points, weights)

@@ -45,7 +45,8 @@ from tracking3d.estimation.online.relocalization import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, is_high_loss, is_misfit
 from tracking3d.estimation.online.state.solver_state import (
     ONLINE_CLASSES,
-    SolverPhase,
+    Initializing,
+    Mapped,
     SolverState,
     thin_out,
 )
@@ -114,7 +115,7 @@ class OnlineSolver:
     def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
         frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
-        if state.phase is SolverPhase.INITIALIZING:
+        if isinstance(state, Initializing):
             return self.initializer.add(state, frame, image, binary)
         state, revised = self.initializer.restart_if_misfit(state)
         if not self.initializer.in_background:  # it takes seconds, for which a live source would wait
@@ -127,12 +128,12 @@ class OnlineSolver:
 
     def _track(
         self,
-        state: SolverState,
+        state: Mapped,
         frame: Frame,
         image: NDArray[np.uint8],
         mask: NDArray[np.bool_] | None,
         options: OnlineConfig,
-    ) -> tuple[SolverState, FrameEstimate]:
+    ) -> tuple[Mapped, FrameEstimate]:
         """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
         view, starts = self.tracker.predict(state, frame, image, mask)
         found = self.tracker.find(state, view, frame, image, starts)
@@ -174,12 +175,12 @@ class OnlineSolver:
 
     def _recover(
         self,
-        state: SolverState,
+        state: Mapped,
         estimate: FrameEstimate,
         frame: Frame,
         image: NDArray[np.uint8],
         mask: NDArray[np.bool_],
-    ) -> tuple[SolverState, FrameEstimate]:
+    ) -> tuple[Mapped, FrameEstimate]:
         """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
 
         Args:
@@ -189,28 +190,27 @@ class OnlineSolver:
             image: ``(H, W)`` grey.
             mask: ``(H, W)`` its initial mask.
         """
-        searched = state.phase is SolverPhase.LOST and should_retry(state.lost_frames)
+        searched = state.lost and should_retry(state.lost_frames)
         for other in state.inactive_maps if searched else ():
             other_state = atlas.activate_map(state, other, frame.index)
             updated, found = self._track(other_state, frame, image, mask, self.options)
             if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
                 return updated, found
-        begun, last = state.reinitialization, None
-        if begun is not None and begun.pending:
-            last = begun.pending[-1][0].mask
+        begun = state.reinitialization
+        last = begun.pending[-1][0].mask if begun is not None and begun.pending else None
         if begun is None or not atlas.masks_overlap(last, mask):
             if not atlas.is_fully_visible(mask) or not atlas.colours_match(state, frame, mask):
                 return replace(state, reinitialization=None), estimate
-            second, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
-            return replace(state, reinitialization=second), estimate
-        begun, again = self.initializer.add(begun, frame, image, mask)
-        if begun.phase is SolverPhase.INITIALIZING:
+            begun, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
             return replace(state, reinitialization=begun), estimate
-        if not atlas.is_reliable(begun, again):
+        second, again = self.initializer.add(begun, frame, image, mask)
+        if isinstance(second, Initializing):
+            return replace(state, reinitialization=second), estimate
+        if not atlas.is_reliable(second, again):
             return replace(state, reinitialization=None), estimate
-        state = state_through_lens(state, begun.camera)
-        similarity = atlas.guess_alignment(state, begun)
-        switched = atlas.switch_map(state, begun, similarity)
+        state = state_through_lens(state, second.camera)
+        similarity = atlas.guess_alignment(state, second)
+        switched = atlas.switch_map(state, second, similarity)
         again = atlas.transform_estimates(again, similarity, state.camera)
         if state.object_map.pointless:  # nothing is held to a map that was doubted all the time
             return replace(switched, inactive_maps=state.inactive_maps, unaligned=False), again
@@ -219,9 +219,9 @@ class OnlineSolver:
     def refine(self, state: SolverState) -> SolverState:
         """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
         state, _ = self.finish_background_work(state)
-        if state.phase is SolverPhase.INITIALIZING:
+        if isinstance(state, Initializing):
             state = self.initializer.finish(state)
-        if state.phase is SolverPhase.INITIALIZING:
+        if isinstance(state, Initializing):
             return state
         state = atlas.merge_maps(state, self.options, state.object_map.keyframes)
         state = atlas.activate_largest_map(
@@ -240,13 +240,14 @@ class OnlineSolver:
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[SolverState, FrameEstimate]:
         """Estimate a frame's pose again, with the final map."""
-        state, frame = atlas.map_of_frame(state, frame.index), mask.on(frame)
-        binary, image, object_map = mask.found, grey(frame.image), state.object_map
+        frame, binary, image = mask.on(frame), mask.found, grey(frame.image)
         T_cam_obj = state.extended.get(frame.index, T_cam_obj)
-        causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
-        if state.surface is None:
+        causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], state.object_map.vertices)
+        if isinstance(state, Initializing):
             waiting = initial_estimate(frame, binary, causal, state.camera)
             return state, replace(waiting, reason=state.waiting_reason or waiting.reason, refined=True)
+        state = atlas.map_of_frame(state, frame.index)
+        object_map = state.object_map
         starts = {"causal": causal}
         followed = follow(state.grey, image, state.tracked_points)
         own = next((view for view in object_map.keyframes if view.index == frame.index), None)
@@ -273,12 +274,11 @@ class OnlineSolver:
     def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
         state, _ = self.finish_background_work(state)
-        if state.inactive_maps:
-            state = atlas.activate_largest_map(state)
-        object_map = state.object_map
-        if not object_map.keyframes:
-            object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
-        return object_map.model(state.surface or object_map.surface())
+        if isinstance(state, Initializing):
+            object_map = replace(state.object_map, keyframes=tuple(view for view, _ in state.pending))
+            return object_map.model(object_map.surface())
+        state = atlas.activate_largest_map(state)
+        return state.object_map.model(state.surface)
 
     def continue_refinement(self, state: SolverState, start: RefinedStart) -> SolverState | None:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
@@ -291,7 +291,7 @@ class OnlineSolver:
         self, state: SolverState, confidence: Mapping[int, float]
     ) -> tuple[SolverState, ModelCoverage] | None:
         """The state with the largest map active, and what it explains; None if it cannot be extended."""
-        if state.phase is SolverPhase.INITIALIZING:
+        if isinstance(state, Initializing):
             return None
         last = state.last_pose[1]
         spans = (*state.spans, (state.active_since, last))
@@ -299,7 +299,7 @@ class OnlineSolver:
         own = {index: confidence[index] for index in atlas.frames_of_map(state, confidence)}
         return refiner.prepare_extension(state, own, self.options)
 
-    def extend(self, state: SolverState, gap: Gap) -> tuple[SolverState, list[FrameEstimate]]:
+    def extend(self, state: Mapped, gap: Gap) -> tuple[Mapped, list[FrameEstimate]]:
         """Track the object through a gap, and insert keyframes there; no estimates if its keyframe was culled."""
         if all(view.index != gap.anchor.index for view in state.object_map.keyframes):
             return state, []
@@ -346,23 +346,25 @@ class OnlineSolver:
             number: The index of the last frame; the next one's follows it.
             T_cam_obj: ``(4, 4)`` the frame's estimate, used if the frame is no keyframe.
         """
-        views = [*state.object_map.keyframes, *(view for view, _ in state.pending or ())]
+        waiting = state.pending if isinstance(state, Initializing) else ()
+        views = [*state.object_map.keyframes, *(view for view, _ in waiting)]
         own = next((view for view in views if view.index == frame.index), None)
         pose = (
             pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], state.object_map.vertices)
             if own is None
             else own.pose
         )
+        points = FollowedPoints.none() if own is None else own.points
+        state = replace(state, last_pose=(pose, number), grey=grey(frame.image), tracked_points=points)
+        if isinstance(state, Initializing):
+            return state
         return replace(
             state,
-            last_pose=(pose, number),
             reinitialization=None,
             previous_pose=None,
-            grey=grey(frame.image),
-            tracked_points=FollowedPoints.none() if own is None else own.points,
             lost_frames=0,
             doubtful_frames=0,
-            trajectory=((pose, number),) if state.pending is None else (),
+            trajectory=((pose, number),),
             motion_references=(),
         )
 
@@ -373,7 +375,7 @@ class OnlineSolver:
         Without inliers against it the mask has full weight. If the last pose is elsewhere, the object was lost
         unnoticed: all of its sides are then tried at the mask.
         """
-        if state.phase is not SolverPhase.INITIALIZING:
+        if isinstance(state, Mapped):
             rendered = state.object_map.silhouette(state.last_pose[0], state.camera)
             if np.count_nonzero(rendered & mask) < _MIN_MASK_IOU * np.count_nonzero(rendered | mask):
                 state = replace(state, lost_frames=max(state.lost_frames, 1))

@@ -31,7 +31,7 @@ from tracking3d.estimation.online.relocalization import (
 )
 from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
 from tracking3d.estimation.online.state.object_map import Keyframe
-from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
@@ -44,7 +44,7 @@ class Tracker:
     weights: PoseWeights  # of a pose's cost terms
 
     def predict(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+        self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[Keyframe, dict[str, Pose]]:
         """The frame after the state's last one, seen from the likeliest of the predicted poses; and all of these.
 
@@ -61,14 +61,13 @@ class Tracker:
 
     def find(
         self,
-        state: SolverState,
+        state: Mapped,
         view: Keyframe,
         frame: Frame,
         image: NDArray[np.uint8],
         starts: dict[str, Pose],
     ) -> PoseCandidate:
         """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful."""
-        assert state.surface is not None
         object_map, camera = state.object_map, state.camera
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
@@ -77,12 +76,10 @@ class Tracker:
         won, fit = fit_pose(object_map, state.surface, view, starts, view.points, self.weights)
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        if state.phase is SolverPhase.LOST or needs_relocalization(fit, state.baseline, support):
+        if state.lost or needs_relocalization(fit, state.baseline, support):
             won, fit, kept = relocalize(state, view, image, (won, fit, kept), self.weights)
             support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        astray = state.phase is SolverPhase.LOST and not is_consistent_with_motion(
-            state, fit.pose, frame.index
-        )
+        astray = state.lost and not is_consistent_with_motion(state, fit.pose, frame.index)
         assessment = assess_pose(fit, state.baseline, support, won == ROTATION_SEARCH, astray)
         if object_map.free_axis is not None:
             fit = replace(fit, pose=object_map.free_axis.untwisted(fit.pose, state.last_pose[0]))
@@ -92,7 +89,7 @@ class Tracker:
             return other if other is not None and other.better_than(best) else best
         return best
 
-    def attempt(self, state: SolverState, view: Keyframe, origin: str, guessed: bool) -> PoseCandidate:
+    def attempt(self, state: Mapped, view: Keyframe, origin: str, guessed: bool) -> PoseCandidate:
         """The candidate from the pose and the points that a view comes with.
 
         Args:
@@ -101,7 +98,6 @@ class Tracker:
             origin: What the pose was found by.
             guessed: Whether it is a guess, see `assess_pose`.
         """
-        assert state.surface is not None
         object_map, camera = state.object_map, state.camera
         _, fit = fit_pose(object_map, state.surface, view, {origin: view.pose}, view.points, self.weights)
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
@@ -110,7 +106,7 @@ class Tracker:
         return PoseCandidate(view, fit, origin, kept, support, assessment)
 
     def _elsewhere(
-        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+        self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
         """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
         where = relocalize_in_frame(

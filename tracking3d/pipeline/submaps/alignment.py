@@ -20,7 +20,7 @@ from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import map_through_lens
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.geometry.alignment import rotation_alignment
 from tracking3d.geometry.camera import Camera
@@ -210,7 +210,7 @@ def check_agreement(fit: SimilarityFit, radius: float) -> None:
 
 
 def align_submaps(
-    first: SolverState, second: SolverState, of_first: Sequence[FrameRecord], of_second: Sequence[FrameRecord]
+    first: Mapped, second: Mapped, of_first: Sequence[FrameRecord], of_second: Sequence[FrameRecord]
 ) -> SubmapAlignment:
     """The similarity from the second part to the first.
 
@@ -244,8 +244,8 @@ def align_submaps(
 
 
 def by_lens(
-    state: SolverState, records: Sequence[FrameRecord], camera: Camera
-) -> tuple[SolverState, list[FrameRecord]]:
+    state: Mapped, records: Sequence[FrameRecord], camera: Camera
+) -> tuple[Mapped, list[FrameRecord]]:
     """A part's map and estimates under another focal length."""
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     seen = []
@@ -256,7 +256,7 @@ def by_lens(
     return through_lens(state, camera), seen
 
 
-def through_lens(state: SolverState, camera: Camera) -> SolverState:
+def through_lens(state: Mapped, camera: Camera) -> Mapped:
     """The state under another focal length: depths scale with it, the object's size stays."""
     before = state.camera
     if camera == before:
@@ -295,8 +295,8 @@ def in_space(
     return replace(object_map, keyframes=keyframes)
 
 
-def merge_states(states: Sequence[SolverState], similarities: Sequence[Similarity], config: OnlineConfig,
-           encoder: FeatureEncoder) -> SolverState:  # fmt: skip
+def merge_states(states: Sequence[Mapped], similarities: Sequence[Similarity], config: OnlineConfig,
+           encoder: FeatureEncoder) -> Mapped:  # fmt: skip
     """What several parts know as one belief, poses, landmarks and shape refined together.
 
     Args:

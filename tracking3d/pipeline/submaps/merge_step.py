@@ -18,7 +18,7 @@ from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.online.atlas import transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
 from tracking3d.estimation.online.state.object_map import ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Initializing, Mapped
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH
 from tracking3d.estimation.segmentation.whole_video import VideoSegmenter
 from tracking3d.features.protocol import FeatureEncoder
@@ -339,14 +339,14 @@ class _Try:
     """The parts merged with one focal length, with their runs and states converted to it."""
 
     runs: Sequence[PartRun]
-    states: Sequence[SolverState]
+    states: Sequence[Mapped]
     alignments: Sequence[SubmapAlignment]
     similarities: Sequence[Similarity]
-    merged: SolverState
+    merged: Mapped
     cost_ratio: float
 
 
-def _lenses(states: Sequence[SolverState]) -> list[Camera]:
+def _lenses(states: Sequence[Mapped]) -> list[Camera]:
     """The different cameras of the parts: if the focal length is not given, each part estimated its own."""
     lenses: list[Camera] = []
     for state in states:
@@ -370,7 +370,7 @@ def _of_lenses(lenses: Sequence[Camera]) -> str:
 def _try_alignment(
     camera: Camera,
     runs: Sequence[PartRun],
-    states: Sequence[SolverState],
+    states: Sequence[Mapped],
     config: OnlineConfig,
     encoder: FeatureEncoder,
 ) -> _Try:
@@ -389,12 +389,12 @@ def _try_alignment(
 
 
 def merge_submap_states(
-    states: Sequence[SolverState],
+    states: Sequence[Mapped],
     similarities: Sequence[Similarity],
     config: OnlineConfig,
     encoder: FeatureEncoder,
-    before: Sequence[SolverState] | None = None,
-) -> tuple[SolverState, float]:
+    before: Sequence[Mapped] | None = None,
+) -> tuple[Mapped, float]:
     """Merge the states of the parts; also returns the cost ratio of their keyframes; see
     `tracking3d.pipeline.submaps.alignment.merge_states`.
 
@@ -420,15 +420,15 @@ def merge_submap_states(
 
 def _read_submaps(
     session: Session, config: PipelineConfig, plan: Plan, folder: Path
-) -> tuple[list[PartRun], list[SolverState]]:
+) -> tuple[list[PartRun], list[Mapped]]:
     """The parts with their states, each with its own camera."""
     runs: list[PartRun] = []
-    states: list[SolverState] = []
+    states: list[Mapped] = []
     for part in plan.parts:
         own = part_folder(folder, part)
         kept = Checkpoint(own, session.state_classes, config.runtime.device).read()
         state = kept.session["solver"]
-        if state.pending is not None:
+        if isinstance(state, Initializing):
             why = state.waiting_reason or "the object did not move enough in it"
             raise DisagreementError(f"the shape could not be initialized in part {part.number + 1} ({why})")
         records = RunReader(own, refined=False).frames
@@ -437,7 +437,7 @@ def _read_submaps(
     return runs, states
 
 
-def _align_pair(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
+def _align_pair(number: int, states: Sequence[Mapped], runs: Sequence[PartRun]) -> SubmapAlignment:
     try:
         return align_submaps(states[0], states[1], runs[0].records, runs[1].records)
     except DisagreementError as error:

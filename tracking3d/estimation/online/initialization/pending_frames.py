@@ -34,7 +34,7 @@ from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses
 from tracking3d.estimation.online.mapping.local_mapping import tracks_of
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import MOST_WAITING, SolverState, thin_out
+from tracking3d.estimation.online.state.solver_state import MOST_WAITING, Initializing, thin_out
 
 MOTION = 0.03
 """Image deformation at which an initialization is first tried, see `image_deformation`."""
@@ -119,8 +119,8 @@ def add_pending_frame(
 
 
 def try_initialize(
-    state: SolverState, config: OnlineConfig, ended: bool = False
-) -> tuple[SolverState, InitialMap | None]:
+    state: Initializing, config: OnlineConfig, ended: bool = False
+) -> tuple[Initializing, InitialMap | None]:
     """The initial map if the pending frames determine it; else None, and the motion of the next attempt.
 
     Args:
@@ -128,7 +128,7 @@ def try_initialize(
         config: The solver's options.
         ended: Whether no more frames follow, so that these must suffice.
     """
-    waiting = state.pending or ()
+    waiting = state.pending
     views = [view for view, _ in waiting if view.mask is not None]
     if len(views) < _MIN_FRAMES:
         return state, None
@@ -190,9 +190,9 @@ def try_initialize(
     return state, starts[0] if starts else None
 
 
-def why_no_map(state: SolverState) -> str:
+def why_no_map(state: Initializing) -> str:
     """What was found where the pending frames do not determine a map, though no more follow."""
-    views = [view for view, _ in state.pending or () if view.mask is not None]
+    views = [view for view, _ in state.pending if view.mask is not None]
     if len(views) < _MIN_FRAMES:
         return f"a first map takes {_MIN_FRAMES} frames that show the object, and there are {len(views)}"
     kept = [
@@ -209,14 +209,14 @@ def why_no_map(state: SolverState) -> str:
     return state.waiting_reason or _STILL
 
 
-def _starts_from_points(state: SolverState, views: list[Keyframe], config: OnlineConfig) -> list[InitialMap]:
+def _starts_from_points(state: Initializing, views: list[Keyframe], config: OnlineConfig) -> list[InitialMap]:
     weights = FitWeights(smoothness=config.smoothness)
     return solve_start(state.object_map, lens_hypotheses(state.camera), views, weights, config.surface_prior)
 
 
 def _start_of_plain_object(
-    state: SolverState, views: list[Keyframe], config: OnlineConfig, ended: bool
-) -> tuple[SolverState, InitialMap | None]:
+    state: Initializing, views: list[Keyframe], config: OnlineConfig, ended: bool
+) -> tuple[Initializing, InitialMap | None]:
     """The initial map of an object without texture, from the frames since it began to turn."""
     last_still = _last_still_view(views)
     if last_still is not None and last_still >= _LONG_STILL:
@@ -230,10 +230,10 @@ def _start_of_plain_object(
 
 
 def _start_without_points(
-    state: SolverState, views: list[Keyframe], config: OnlineConfig
-) -> tuple[SolverState, InitialMap | None]:
+    state: Initializing, views: list[Keyframe], config: OnlineConfig
+) -> tuple[Initializing, InitialMap | None]:
     """The initial map from pixels and outlines alone; None if nothing shows that the object rotates."""
-    waiting = state.pending or ()
+    waiting = state.pending
     if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= MOST_WAITING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
@@ -244,15 +244,15 @@ def _start_without_points(
     )[0]
 
 
-def _refuse(state: SolverState, views: list[Keyframe]) -> SolverState:
+def _refuse(state: Initializing, views: list[Keyframe]) -> Initializing:
     """The state after a map without points that misses its masks: later frames may show more of the shape."""
     later = views[min(_RETRY_INTERVAL, len(views) - 1)].index
     return replace(_set_aside(state, later), waiting_reason=_NO_SHAPE, ambiguous_frames=0)
 
 
-def _set_aside(state: SolverState, first: int) -> SolverState:
+def _set_aside(state: Initializing, first: int) -> Initializing:
     """The state whose first map is made without the pending frames before the one of index ``first``."""
-    waiting = state.pending or ()
+    waiting = state.pending
     rested = thin_out((*state.rested, *(one for one in waiting if one[0].index < first)))
     return replace(state, rested=rested, pending=tuple(one for one in waiting if one[0].index >= first))
 

@@ -14,7 +14,7 @@ import torch
 
 from tracking3d.estimation.online.mapping.local_mapping import shared_landmarks, structure_of, tracks_of
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import InactiveMap, SolverState
+from tracking3d.estimation.online.state.solver_state import InactiveMap, Mapped
 from tracking3d.geometry.camera import OUTERMOST_LENSES, Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
@@ -71,7 +71,7 @@ def inactive_map_through_lens(other: InactiveMap, before: Camera, after: Camera)
     return replace(other, object_map=map_through_lens(other.object_map, before, after))
 
 
-def state_through_lens(state: SolverState, after: Camera) -> SolverState:
+def state_through_lens(state: Mapped, after: Camera) -> Mapped:
     """The state with its maps and poses as seen with another focal length."""
     before = state.camera
     factor = after.fy / before.fy

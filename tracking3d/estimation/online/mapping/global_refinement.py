@@ -21,7 +21,7 @@ from tracking3d.estimation.online.optimization.pose_refinement import refine_pos
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_from_arrays
 from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
@@ -100,7 +100,7 @@ _TRACK_DEVIATION = 1.0  # pixels, of points that were tracked from frame to fram
 _HELD = 0.05  # deviation of the map's landmarks from the surface, in radii
 
 
-def refine_by_landmarks(state: SolverState, config: OnlineConfig) -> SolverState:
+def refine_by_landmarks(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state with map, camera and last pose refined by dense landmarks; unchanged if these say too little.
 
     Nothing happens before enough keyframes are new.

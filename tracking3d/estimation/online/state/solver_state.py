@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum, auto
 from typing import Any
 
 import numpy as np
@@ -29,17 +28,6 @@ MOST_WAITING = 40
 """Most frames that are kept with their estimates because their poses may come or change later."""
 
 
-class SolverPhase(Enum):
-    """What the solver does with the next frame."""
-
-    INITIALIZING = auto()
-    """It collects pending frames until they show enough motion for a first map."""
-    TRACKING = auto()
-    """It tracks the object against the map."""
-    LOST = auto()
-    """It relocalizes the object, or initializes a second map."""
-
-
 @dataclass(frozen=True)
 class MaskAgreement:
     """How far the initial masks of the keyframes agree with each other."""
@@ -62,26 +50,46 @@ class InactiveMap:
 
 
 @dataclass(frozen=True, eq=False)
-class SolverState:
-    """What the solver knows between two frames."""
+class _AnyState:
+    """What the solver knows between two frames, with or without a map."""
 
     camera: Camera  # the camera of the video
-    object_map: ObjectMap  # the object's map
-    surface: Surface | None  # the map's surface, as poses are fitted to it
+    object_map: ObjectMap  # the object's map; before the first one, what the pending frames are compared by
     last_pose: tuple[Pose, int]  # pose and index of the last frame, also if the object was lost in it
-    previous_pose: tuple[Pose, int] | None  # the same of the frame before it; None if no motion is known
     grey: NDArray[np.uint8]  # (H, W) the last frame
     tracked_points: FollowedPoints  # points in the last frame
-    # the frames that wait for the first map, with their estimates so far; None once there is a map
-    pending: tuple[tuple[Keyframe, FrameEstimate], ...] | None = ()
     # the projection of the encoder's features; None leaves them as they are
     feature_space: FeatureSpace | None = None
+    # poses (4, 4) that frames are refined from in place of their causal ones, by frame index
+    extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Initializing(_AnyState):
+    """Frames are collected until they show enough motion for a first map."""
+
+    # the frames that wait for the first map, with their estimates so far
+    pending: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    # frames before the pending ones, in which the object did not turn yet; the first map gives them a pose
+    rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     next_attempt: float = 0.0  # the motion at which the next initialization is tried
     # how many frames the last initialization had if it was ambiguous; 0 if there was none
     ambiguous_frames: int = 0
     # (3,) the object's rotation in that initialization as a rotation vector, or None
     ambiguous_rotation: NDArray[np.float64] | None = None
     waiting_reason: str = ""  # why the initialization waits, if not for motion
+    # the initialization that is computed in another thread, if there is one; see
+    # `tracking3d.estimation.online.initializer`
+    background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mapped(_AnyState):
+    """The object is tracked against its map, or was lost, see `lost`."""
+
+    surface: Surface  # the map's surface, as poses are fitted to it
+    # pose and index of the frame before the last one; None if no motion is known
+    previous_pose: tuple[Pose, int] | None = None
     baseline: LossBaseline = field(default_factory=LossBaseline)  # the losses of tracked frames
     # how many frames in a row the object has been lost; those without a mask, in which no hypothesis can be
     # tried, count as one
@@ -95,8 +103,8 @@ class SolverState:
     trajectory: tuple[tuple[Pose, int], ...] = ()
     colours: ColourModels | None = None  # colours of object and background in tracked frames
     motion_references: tuple[MotionReference, ...] = ()  # the last tracked frames, for the motion cue
-    # the state of a second initialization, which goes on while the object is lost and has a mask
-    reinitialization: SolverState | None = None
+    # a second initialization, which goes on while the object is lost and has a mask
+    reinitialization: Initializing | None = None
     inactive_maps: tuple[InactiveMap, ...] = ()  # the other maps of the object
     # first and last index of the earlier frames that were estimated with the active map
     spans: tuple[tuple[int, int], ...] = ()
@@ -106,30 +114,20 @@ class SolverState:
     reversal_attempt: tuple[int, float] = (0, 0.0)
     # how far the initial masks of the keyframes agree with each other
     mask_agreement: MaskAgreement = MaskAgreement()
-    # poses (4, 4) that were found when the largest map was extended over frames that it did not explain, by
-    # frame index
-    extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    # frames before the pending ones, in which the object did not turn yet; the first map gives them a pose
-    rested: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
     # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is restarted, they are
     # estimated anew. Empty if it cannot be restarted.
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
-    # the initialization that is computed in another thread, if there is one; see
-    # `tracking3d.estimation.online.initializer`
-    background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
     @property
-    def phase(self) -> SolverPhase:
-        """Which phase the solver is in."""
-        if self.pending is not None:
-            return SolverPhase.INITIALIZING
-        return SolverPhase.LOST if self.lost_frames else SolverPhase.TRACKING
+    def lost(self) -> bool:
+        """Whether the object was lost in the last frame: it is relocalized, or a second map is initialized."""
+        return self.lost_frames > 0
 
-    def with_map(self, object_map: ObjectMap, **changes: Any) -> SolverState:
+    def with_map(self, object_map: ObjectMap, **changes: Any) -> Mapped:
         """The state with another map and its surface, and with further changes."""
         return replace(self, object_map=object_map, surface=object_map.surface(), **changes)
 
-    def moved(self, object_map: ObjectMap, move: Callable[[Pose], Pose], **changes: Any) -> SolverState:
+    def moved(self, object_map: ObjectMap, move: Callable[[Pose], Pose], **changes: Any) -> Mapped:
         """The state with a map in other coordinates, which ``move`` takes the last poses to."""
 
         def there(at: tuple[Pose, int]) -> tuple[Pose, int]:
@@ -144,13 +142,9 @@ class SolverState:
         }
         return self.with_map(object_map, **changes)
 
-    def advanced(
-        self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints
-    ) -> SolverState:
-        """The state one frame later."""
-        return replace(
-            self, last_pose=(pose, index), previous_pose=self.last_pose, grey=grey, tracked_points=followed
-        )
+
+SolverState = Initializing | Mapped
+"""What the solver knows between two frames: the type is its phase."""
 
 
 def thin_out(
@@ -165,7 +159,8 @@ def thin_out(
 ONLINE_CLASSES = (
     InactiveMap,
     MaskAgreement,
-    SolverState,
+    Initializing,
+    Mapped,
     ColourModels,
     MotionReference,
     ObjectMap,
