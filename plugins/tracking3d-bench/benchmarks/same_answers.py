@@ -168,7 +168,7 @@ class Sequence:
             version.command(*run, "--split", f"{max(count // 2, LEAST_PART)}f", "--workers", "1")
         elif self.way == "resumed":
             version.stop(folder, count // 2, *run)
-            version.command("run", "--resume", "--out", folder, "--quiet")
+            version.command(*run, "--resume")
         else:
             version.command(*run)
         if self.way == "corrected":
