@@ -16,7 +16,7 @@ MOST_PARAMETERS = 12
 
 # Today's figures, to be lowered as steps of the house land, and raised by nobody without a reason.
 DEEPEST_INHERITANCE = 2  # of errors; 1 without them
-MOST_IMPORT_LINES = 0.081
+MOST_IMPORT_LINES = 0.08
 """Share of all lines."""
 
 SMALL_MODULE = 120

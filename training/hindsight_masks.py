@@ -34,7 +34,7 @@ PIXELS = 400
 """Of a frame, at most; three in four of them near an outline."""
 _NEAR = 0.1
 _LEAST_OVERLAP = 0.4  # below with both masks, a frame is of something else
-_WEIGHTS = Path(__file__).resolve().parents[1] / "tracking3d" / "estimation" / "segmentation" / "whole_video_weights.py"
+_WEIGHTS = Path(__file__).resolve().parents[1] / "tracking3d/estimation/segmentation/whole_video_weights.py"
 
 
 def answered_frames(run: RunReader, clip: Path) -> Iterator[ObjectView]:

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask
-from tracking3d.estimation.solver import (
-    Gap,
-    ModelCoverage,
-    PhotoSet,
-    RefinedStart,
-    RefiningSolver,
-    Solver,
-)
+from tracking3d.estimation.solver import Gap, ModelCoverage, PhotoSet, RefinedStart, RefiningSolver, Solver
 from tracking3d.estimation.undistortion import Undistortion
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera

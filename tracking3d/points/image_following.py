@@ -15,14 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tracking3d.points.pictures import (
-    Grey,
-    Picture,
-    contrast,
-    likeness,
-    patches,
-    placement_variance,
-)
+from tracking3d.points.pictures import Grey, Picture, contrast, likeness, patches, placement_variance
 from tracking3d.runtime.progress import report_each
 from tracking3d.scene.view import Array
 

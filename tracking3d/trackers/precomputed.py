@@ -16,13 +16,7 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.cues import Cues
-from tracking3d.trackers.mask_files import (
-    ImageMasks,
-    MaskFiles,
-    UnreadableMaskError,
-    natural_key,
-    open_masks,
-)
+from tracking3d.trackers.mask_files import ImageMasks, MaskFiles, UnreadableMaskError, natural_key, open_masks
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import ColourSegmentation
 from tracking3d.trackers.vot_regions import RegionMasks

@@ -3,14 +3,7 @@
 from __future__ import annotations
 
 from tracking3d.cli.options.general import AsJson, Debug, Quiet, Run, RunOrParent, Video, grouped, numbers
-from tracking3d.cli.options.settings import (
-    ConfigFile,
-    Overrides,
-    Preset,
-    Quality,
-    SettingsOptions,
-    configure,
-)
+from tracking3d.cli.options.settings import ConfigFile, Overrides, Preset, Quality, SettingsOptions, configure
 
 __all__ = [
     "AsJson",

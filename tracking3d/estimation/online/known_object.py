@@ -29,11 +29,7 @@ from tracking3d.estimation.online.masks import initial_estimate, learn_colours, 
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.pose_tracking import candidate_cost, pose_of_points
-from tracking3d.estimation.online.relocalization import (
-    overlaps_mask,
-    poses_from_matches,
-    should_retry,
-)
+from tracking3d.estimation.online.relocalization import overlaps_mask, poses_from_matches, should_retry
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap

@@ -15,9 +15,7 @@ from tracking3d.estimation.estimate import ELSEWHERE
 from tracking3d.estimation.observation import projected_box
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
-from tracking3d.estimation.online.mapping.local_mapping import (
-    nearest_views,
-)
+from tracking3d.estimation.online.mapping.local_mapping import nearest_views
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.pose_tracking import (
