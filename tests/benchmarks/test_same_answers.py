@@ -71,6 +71,16 @@ def test_a_frame_without_a_pose_on_one_side_differs_without_bound(run, other):
     assert compare(run, other).causal == np.inf
 
 
+def test_exported_files_are_compared_but_for_the_path_of_the_run(run, other):
+    for folder in (run, other):
+        (folder / "exported").mkdir()
+        (folder / "exported/note.json").write_text(f'{{"run": "{folder}"}}')
+    assert compare(run, other).same
+    (other / "exported/note.json").write_text("{}")
+    (run / "exported/poses.txt").write_text("0 0 0")
+    assert compare(run, other).remarks == ["exported/note.json differs", "exported/poses.txt differs"]
+
+
 def test_rounding_below_the_tolerance_is_the_same(run, other):
     replace(other / "frames.jsonl", "2.5", "2.5000000000001")
     found = compare(run, other)

@@ -268,17 +268,17 @@ def read_vertices(run: Path) -> np.ndarray:
 
 
 def exports_that_differ(before: Path, after: Path) -> list[str]:
-    """Names of exported files that one run lacks or that differ in a byte; runs without exports have none."""
+    """Names of exported files that one run lacks or that differ in more than the path of the run."""
     files = [
-        {file.relative_to(run): file for file in sorted((run / "exported").rglob("*")) if file.is_file()}
+        {
+            file.relative_to(run): file.read_bytes().replace(str(run).encode(), b"RUN")
+            for file in (run / "exported").rglob("*")
+            if file.is_file()
+        }
         for run in (before, after)
     ]
-    names = sorted(files[0].keys() | files[1].keys())
     return [
-        str(name)
-        for name in names
-        if not (name in files[0] and name in files[1])
-        or files[0][name].read_bytes() != files[1][name].read_bytes()
+        str(name) for name in sorted(files[0].keys() | files[1]) if files[0].get(name) != files[1].get(name)
     ]
 
 
