@@ -18,8 +18,7 @@ from recorded_runs import model as sphere
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.feature_space import KnownObject
-from tracking3d.estimation.online.known_object import SIDES, map_of_known_object
+from tracking3d.estimation.online.known_object import SIDES, KnownObject, map_of_known_object
 from tracking3d.estimation.shape import RADIUS
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.gltf_axes import read_mesh_file

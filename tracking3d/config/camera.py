@@ -1,4 +1,4 @@
-"""The camera that a configuration gives."""
+"""The camera that a configuration gives, and the size of the object: what lengths are measured by."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ would teach it as many errors as it mends, and what it was taught wrongly comes 
 
 WORTH_CORRECTING = (0.5, 0.9)
 """IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
-width of an outline; below, one of them is of something else, and nobody knows which."""
+width of an outline; below, one of them is of something else, and it is not known which."""
 
 
 RELOCALIZED = "relocalized"

@@ -11,8 +11,7 @@ import torch
 from tracking3d.config.models import PipelineConfig, RuntimeConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.feature_space import KnownObject
-from tracking3d.estimation.online.known_object import KnownObjectSolver
+from tracking3d.estimation.online.known_object import KnownObject, KnownObjectSolver
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import Solver

@@ -15,7 +15,7 @@ from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.estimation.feature_space import KnownObject
+from tracking3d.estimation.online.known_object import KnownObject
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.mesh_checks import sound_mesh_file, what_is_wrong
 from tracking3d.rendering.backprojection import TexelMap, face_atlas, on_faces, paint_faces, shares_no_texel

@@ -1,4 +1,4 @@
-"""A lost object that comes back by a side that nobody knows is tracked anew, and joined when a side is known."""
+"""A lost object that comes back by an unseen side gets a second map, which is merged when a known side is seen."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import RELOCALIZED, FrameEstimate, ObjectModel, Status
-from tracking3d.estimation.feature_space import FeatureSpace, KnownObject, feature_channels
+from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.observation import Observation, crop, mask_box, observe
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.features.sift import Keypoints, detect, match
@@ -51,6 +51,57 @@ _OUTLINED = "outline"
 _ENOUGH_ALONE, _MOSTLY_SEEN = 30, 0.5
 """Points that tell a first pose without a mask, and the share of unseen texture below which they do."""
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownObject:
+    """An object that an earlier run, a scan or a drawing knows.
+
+    Solvers have it with its middle at the origin and a radius of `tracking3d.estimation.shape.RADIUS`, since
+    their tolerances are made for that; what they answer is turned back into the object's own coordinates and unit.
+    """
+
+    name: str  # what sentences call it
+    model: ObjectModel  # in its own coordinates; texture_weight is 0 if its colours are not known
+    camera: Camera | None = None  # the camera that it was learnt with; None if there was none
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether the colours of any of it are known."""
+        return bool((self.model.texture_weight > 0).any())
+
+    @cached_property
+    def centre(self) -> NDArray[np.float64]:
+        """``(3,)`` the middle of its bounding box."""
+        vertices = self.model.vertices
+        return np.asarray(0.5 * (vertices.min(0) + vertices.max(0)))
+
+    @cached_property
+    def scale(self) -> float:
+        """The solver's units in one of the object's own."""
+        return RADIUS / max(float(np.linalg.norm(self.model.vertices - self.centre, axis=1).max()), 1e-12)
+
+    @cached_property
+    def vertices(self) -> NDArray[np.float64]:
+        """``(V, 3)`` as the solver has them."""
+        return np.asarray(self.scale * (self.model.vertices - self.centre))
+
+    def to_solver(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``(4, 4)`` the solver's pose for one of the object in its own coordinates."""
+        T = T_cam_obj.copy()
+        T[:3, 3] = self.scale * (T_cam_obj[:3, :3] @ self.centre + T_cam_obj[:3, 3])
+        return T
+
+    def from_solver(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_solver`."""
+        T = T_cam_obj.copy()
+        T[:3, 3] = T_cam_obj[:3, 3] / self.scale - T_cam_obj[:3, :3] @ self.centre
+        return T
+
+    def answered(self, estimate: FrameEstimate) -> FrameEstimate:
+        """A solver's estimate with the pose in the object's own coordinates."""
+        earlier = tuple(self.answered(one) for one in estimate.revised)
+        return replace(estimate, T_cam_obj=self.from_solver(estimate.T_cam_obj), revised=earlier)
 
 
 @dataclass(frozen=True)
@@ -511,7 +562,7 @@ def render_side(
         side = camera.width, camera.height
         return np.asarray(cv2.resize(values, side, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
-    # The centre of a pixel is where four finer ones meet; none of them may lie beside the object.
+    # The centre of a pixel is where four finer ones meet; all of them must lie on the object.
     corners_of = [
         points[row::_SUPERSAMPLING, column::_SUPERSAMPLING]
         for row in range(_SUPERSAMPLING)

@@ -272,7 +272,7 @@ def _warp_to_window(image: NDArray[np.uint8], of_window: Matrix, window: Window)
 #
 # Motion shows where there are edges, and goes over the object's own outline by up to half a patch; so gaps are closed
 # and the outermost is taken off again. An arm that holds the object moves along as well, but goes on beyond it: what
-# has a colour that is seen well beside the object, too, is left out.
+# has a colour of the background, too, is left out.
 
 MOVES = 0.35
 """Of what `tracking3d.estimation.segmentation.online_motion_cue` says, from which on something does."""
@@ -281,7 +281,7 @@ _CLOSED = 0.1  # of the root of the area: gaps between what moves along, which i
 _DENSE = 0.2  # share of a part in which motion is seen
 _SURROUNDINGS = -1.0  # of `unlike_surroundings`, below which a colour is of them
 _REACH = 0.15  # of the root of the area, in one frame
-_FAR = 0.25  # of the root of the area, from which on something lies well beside the object
+_FAR = 0.25  # of the root of the area, from which on something is background
 _RARE = 0.002  # share of the surroundings that a colour needs to be theirs
 
 
@@ -343,7 +343,7 @@ def _disc(radius: float) -> NDArray[np.uint8]:
 
 
 def unlike_surroundings(lab: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """``(S, S)`` log of how rare a colour is well beside the object: an arm goes on where the object has ended."""
+    """``(S, S)`` log of how rare a colour is in the background: an arm goes on where the object has ended."""
     distance = relative_distance(known)
     far = distance < -_FAR
     if not far.any():

@@ -115,7 +115,7 @@ class Mapped(_AnyState):
     # how far the initial masks of the keyframes agree with each other
     mask_agreement: MaskAgreement = MaskAgreement()
     # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is restarted, they are
-    # estimated anew. Empty if it cannot be restarted.
+    # estimated with the new map. Empty if it cannot be restarted.
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
 
     @property
