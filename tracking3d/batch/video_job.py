@@ -1,4 +1,4 @@
-"""One video of a batch: its path, prompt, settings, and the name of its results."""
+"""One video of a batch: its path, prompt, settings, the name of its results, and the networks that it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What travels out of the estimator: one estimate a frame, and the object at the end.
+"""What travels out of the estimator: one estimate a frame, whether its mask is trusted, and the object at the end.
 
 Conventions: OpenCV camera axes (x right, y down, z forward), ``T_cam_obj`` maps object to camera coordinates,
 ``x_cam = R x_obj + t``; the scale of the object is arbitrary.

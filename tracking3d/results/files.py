@@ -1,4 +1,4 @@
-"""Atomic writing of files, with errors in one sentence."""
+"""Atomic writing of files, with errors in one sentence; masks and probabilities as files, and a run folder's lock."""
 
 from __future__ import annotations
 

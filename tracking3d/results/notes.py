@@ -1,4 +1,4 @@
-"""Notes for readers of a run, in sentences: assumptions, and surface that was never seen."""
+"""Notes for readers of a run, in sentences: assumptions, surface that was never seen, and which frames are doubtful."""
 
 from __future__ import annotations
 

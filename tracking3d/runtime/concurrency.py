@@ -1,4 +1,4 @@
-"""Work in background threads: reading the next frames, and writing the estimates.
+"""Work in background threads: reading the next frames, writing the estimates, and what is done at intervals.
 
 One thread reads a few frames ahead; every recording has one that writes, one estimate behind at most. Reading and
 writing change no estimate, so that these are the same on every run, however busy the machine is. Frames that do not

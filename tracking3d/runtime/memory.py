@@ -1,4 +1,4 @@
-"""How much memory this process holds, now and at most."""
+"""How much memory this process holds, now and at most, and when garbage is collected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of an image to a network's input, and of pixels back."""
+"""Conversion of an image to a network's input, and of what it gives back to pixels and proposed masks."""
 
 from __future__ import annotations
 
