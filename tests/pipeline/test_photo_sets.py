@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 from functools import cache
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from resumable_runs import Stopped, assert_alike, settings, stop_at
 
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.solver import PhotoEstimates
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
 from tracking3d.results.files import write_image
 from tracking3d.results.notes import notes_of_run
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
@@ -123,6 +125,10 @@ def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
     run = {"source_notes": [], "camera": camera, "refinement": {"start": {"advice": advice}}}
     unseen = SimpleNamespace()  # a model that would be asked for what was never seen
     assert notes_of_run(run, unseen, []) == [advice]
+    bottle = cast(FrameRecord, SimpleNamespace(free_axis=(0.0, 1.0, 0.0)))
+    assert advice not in notes_of_run(run, None, [bottle]) and FREE_ROTATION in notes_of_run(
+        run, None, [bottle]
+    )
 
 
 @pytest.mark.slow

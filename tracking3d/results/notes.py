@@ -37,12 +37,13 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     """
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
     counted = (run.get("prompt") or {}).get("frames") is not None
-    advice = advice_on_photos(run)
+    revolved = any(one.free_axis for one in records)
+    advice = "" if revolved else advice_on_photos(run)  # it is tracked without points that could join photos
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
         *([advice] if advice else ()),
-        *([FREE_ROTATION] if any(one.free_axis for one in records) else ()),
+        *([FREE_ROTATION] if revolved else ()),
         *describe_camera_and_model(run["camera"], None if advice else model),
     ]
 
