@@ -26,7 +26,7 @@ _TERMS = {  # weight, and the range that was seen
     "missed": (-6.219, 0.0, 0.5394),
     "unseen_ratio": (-3.339, 0.00157, 0.5698),
     "outlier_ratio": (-0.6459, 0.0, 0.3333),
-    "deviation": (-1.1, math.log(0.05), math.log(10.0)),
+    "deviation": (-1.0, math.log(0.05), math.log(10.0)),
 }
 # What is rendered counts as four points with a loss of .3 (fitted): without inliers the curvature alone decides
 _RENDERED_POINTS, _RENDERED_LOSS = 4, 0.3
