@@ -37,9 +37,10 @@ def is_reconstructed(
         return False
     if source is not None and not source.repeatable:
         return False
-    rotations = [
-        record.T_cam_obj[:3, :3] for record in records if record.refined and record.status is Status.TRACKED
-    ]
+    final = [record for record in records if record.refined and record.status is Status.TRACKED]
+    if any(record.free_axis for record in final):  # a surface of revolution is smooth; that of all frames is not
+        return False
+    rotations = [record.T_cam_obj[:3, :3] for record in final]
     return has_packages() and len(rotations) >= FEWEST and largest_turn(np.stack(rotations)) >= LEAST_TURN
 
 
