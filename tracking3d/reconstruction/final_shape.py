@@ -38,7 +38,7 @@ def is_reconstructed(
     if source is not None and not source.repeatable:
         return False
     final = [record for record in records if record.refined and record.status is Status.TRACKED]
-    if any(record.free_axis for record in final):  # a surface of revolution is smooth; that of all frames is not
+    if any(record.free_axis for record in final):  # a surface of revolution is smooth, that of all frames not
         return False
     rotations = [record.T_cam_obj[:3, :3] for record in final]
     return has_packages() and len(rotations) >= FEWEST and largest_turn(np.stack(rotations)) >= LEAST_TURN
