@@ -45,13 +45,13 @@ ROOM_LINES = {
     "points": 3600,
     "reconstruction": 3800,
     "rendering": 3800,
-    "results": 6750,
+    "results": 6800,
     "runtime": 1150,
     "scene": 350,
     "testing": 1100,
     "trackers": 6250,
     "ui": 5100,
-    "video": 2500,
+    "video": 2550,
 }
 """Lines that a room may have: today's, in fifties. Who needs more raises it in the same commit, and says why."""
 
