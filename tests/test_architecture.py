@@ -43,15 +43,15 @@ ROOM_LINES = {
     "pipeline": 6650,
     "plugins": 800,
     "points": 3600,
-    "reconstruction": 3800,
+    "reconstruction": 3850,
     "rendering": 3800,
-    "results": 6750,
+    "results": 6900,
     "runtime": 1150,
     "scene": 350,
     "testing": 1100,
     "trackers": 6250,
     "ui": 5100,
-    "video": 2500,
+    "video": 2550,
 }
 """Lines that a room may have: today's, in fifties. Who needs more raises it in the same commit, and says why."""
 
