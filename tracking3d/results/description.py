@@ -133,7 +133,7 @@ def refinement(
 def summary(
     records: Sequence[FrameRecord],
     skipped: int,
-    seconds: float,
+    passes: Mapping[str, float],
     causal: Sequence[FrameRecord] | None = None,
 ) -> dict[str, Any]:
     """Counts, plug-in failures, timings, mean IoU, where masks come from and highest memory of a run.
@@ -141,7 +141,7 @@ def summary(
     Args:
         records: The estimate for every frame.
         skipped: Number of frames that could not be decoded.
-        seconds: Wall time of the whole run.
+        passes: Wall time of the run by pass.
         causal: The causal estimates, whose seconds are the run's; ``records`` themselves if None.
     """
     causal = records if causal is None else causal
@@ -163,7 +163,8 @@ def summary(
             {"reason": reason, "frames": frames} for reason, frames in failures.most_common(MOST_FAILURES)
         ],
         "timings": {
-            "seconds_total": seconds,
+            "seconds_total": sum(passes.values()),
+            "passes": dict(passes),
             "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,
             "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
             "stages": _plain(stages_of(causal)),
