@@ -8,7 +8,7 @@ import re
 import socket
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -88,6 +88,8 @@ class StartOfModel:
     frame: int  # index of the frame
     reason: str  # why it started there, in words
     advice: str = ""  # of photos: which could not be joined, and what to do; empty if all were
+    # how many frames were tried once more because the object was lost, by what
+    tried: Mapping[str, int] = field(default_factory=dict)
 
 
 def refinement(
@@ -119,7 +121,7 @@ def refinement(
         "reason": reason,
         "start": None
         if start is None
-        else {key: value for key, value in asdict(start).items() if value != ""},
+        else {key: value for key, value in asdict(start).items() if value not in ("", {})},
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
         "kept_refined": kept if refined else 0,
