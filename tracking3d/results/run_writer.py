@@ -82,7 +82,9 @@ class RunWriter:
     ) -> None:
         self.folder = Path(folder)
         self._camera, self._fps = header.camera, header.fps or DEFAULT_FPS
-        self._started, self._drawing, self._over = time.monotonic(), 0.0, False
+        self._passes: dict[str, float] = {}
+        self._pass, self._pass_began = "tracking", time.monotonic()
+        self._drawing, self._over = 0.0, False
         self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
         self._sheet = RegularWork(partial(self._write_contact_sheet, None), SHEET_EVERY, SHEET_SHARE)
         self._refinement: RefinementWriter | None = None
@@ -115,7 +117,16 @@ class RunWriter:
     @property
     def seconds(self) -> float:
         """Wall time of the run so far, pauses left out."""
-        return time.monotonic() - self._started
+        return sum(self.passes.values())
+
+    @property
+    def passes(self) -> dict[str, float]:
+        """The same by pass; `tracking` is the first."""
+        return self._passes | {self._pass: time.monotonic() - self._pass_began}
+
+    def begin_pass(self, name: str) -> None:
+        """From here on time belongs to the pass ``name``."""
+        self._passes, self._pass, self._pass_began = self.passes, name, time.monotonic()
 
     @property
     def lines(self) -> int:
@@ -299,7 +310,7 @@ class RunWriter:
         self._lines.go_on(so_far.lines)
         known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._kept = {record.index: record for record in known}
-        self._started -= so_far.seconds
+        self._passes["earlier"] = so_far.seconds
         self._description |= {key: earlier[key] for key in _STAYS & earlier.keys()}
         again = {"at": description.now(), "frames": len(known)}
         self._description["resumed"] = [*earlier.get("resumed", ()), again]
@@ -395,7 +406,7 @@ class RunWriter:
     def _summarize(self, records: list[FrameRecord]) -> dict[str, Any]:
         """Counts and times of the run so far."""
         skipped = len(self._description["skipped"])
-        return description.summary(latest(records), skipped, self.seconds, latest(records, refined=False))
+        return description.summary(latest(records), skipped, self.passes, latest(records, refined=False))
 
 
 PICTURES = (layout.OVERLAY, layout.CONTACT_SHEET)
