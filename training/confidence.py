@@ -42,7 +42,7 @@ from tracking3d_bench.evaluation.confidence_fit import (
     fit_confidence,
     halves,
 )
-from tracking3d_bench.evaluation.confidence_scores import right_frames
+from tracking3d_bench.evaluation.confidence_scores import frame_difficulties, right_frames
 from tracking3d_bench.evaluation.mask_scores import compare_masks
 from tracking3d_bench.evaluation.pose_scores import pair_poses, rotation_errors
 
@@ -56,12 +56,14 @@ class Judged:
         group: The folder of the benchmark.
         evidence: What the run knew, by name.
         right: What the truth says.
+        difficulty: See `frame_difficulties`.
     """
 
     sequence: str
     group: str
     evidence: dict[str, float]
     right: bool
+    difficulty: float
 
 
 def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterator[Judged]:
@@ -78,6 +80,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
         pairs = pair_poses(answers, truth)
         rotation = {} if pairs is None else rotation_errors(pairs)
         right = right_frames(answers, rotation, compare_masks(answers, truth))
+        difficulty = frame_difficulties(truth)
         for record in reader.frames:
             if record.index in right:
                 known = record.iou_initial is not None
@@ -91,7 +94,8 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                     "recorded_odds": _log_odds(record.confidence),
                     **_of_landmarks(record),
                 }
-                yield Judged(truth.name, benchmark.resolve().name, evidence, right[record.index])
+                group, hard = benchmark.resolve().name, difficulty.get(record.index, 0.0)
+                yield Judged(truth.name, group, evidence, right[record.index], hard)
 
 
 def _log_odds(probability: float) -> float:
@@ -139,23 +143,31 @@ def fit_groups(
     for group in groups:
         others = [one for one in frames if one.group != group]
         fit = fit_confidence(*table(others, names), signs, penalty, balanced(others))
-        evidence, right = table([one for one in frames if one.group == group], names)
-        recorded = np.array([one.evidence["recorded"] for one in frames if one.group == group])
+        held_out = [one for one in frames if one.group == group]
+        evidence, right = table(held_out, names)
+        recorded = np.array([one.evidence["recorded"] for one in held_out])
         print(f"{group}: {len(right)} frames, {right.mean():.2f} right")
-        print(f"  fitted on the others: {tested(fit(evidence), right)}")
-        print(f"  recorded:             {tested(recorded, right)}")
+        print(f"  fitted on the others: {tested(fit(evidence), held_out)}")
+        print(f"  recorded:             {tested(recorded, held_out)}")
     everything = fit_confidence(*table(frames, names), signs, penalty, balanced(frames))
     print("\n# fitted on all groups:")
     print(as_python_source(everything))
     return everything
 
 
-def tested(said: np.ndarray, right: np.ndarray) -> str:
+def tested(said: np.ndarray, frames: list[Judged]) -> str:
     """What confidences ``(N,)`` are worth, in words."""
+    right = np.array([one.right for one in frames], dtype=bool)
+    difficulty = np.array([one.difficulty for one in frames])
+    hardest = difficulty >= np.quantile(difficulty, 0.75)
     error, area = expected_calibration_error(said, right), area_under_roc(said, right)
+    hard = expected_calibration_error(said[hardest], right[hardest])
     brier = float(np.mean((said - right) ** 2))
     shown = "-" if area is None else f"{area:.3f}"
-    return f"calibration error {error:.3f}, area under the curve {shown}, Brier score {brier:.3f}"
+    return (
+        f"calibration error {error:.3f}, of the hardest quarter {hard:.3f}, area under the curve {shown}, "
+        f"Brier score {brier:.3f}"
+    )
 
 
 def main(words: list[str]) -> None:
@@ -179,18 +191,19 @@ def main(words: list[str]) -> None:
         raise InputError("At least two sequences with finished runs are needed; give other folders.")
     fits: list[LogisticConfidence] = []
     for fitted, other in ((first, second), (second, first)):
+        tests = [one for one in frames if one.sequence in other]
         learnt, held_out = (
-            table([one for one in frames if one.sequence in half], names) for half in (fitted, other)
+            table(half, names) for half in ([one for one in frames if one.sequence in fitted], tests)
         )
         fits.append(fit_confidence(*learnt, signs, options.penalty))
         evidence, right = held_out
         said = fits[-1](evidence)
         print(f"fitted on {len(fitted)} sequences, {len(learnt[1])} frames, {learnt[1].mean():.2f} right")
         print(f"tested on {len(other)} sequences, {len(right)} frames, {right.mean():.2f} right")
-        print(f"  fitted:   {tested(said, right)}")
-        recorded = table([one for one in frames if one.sequence in other], ["recorded"])[0]["recorded"]
+        print(f"  fitted:   {tested(said, tests)}")
+        recorded = table(tests, ["recorded"])[0]["recorded"]
         if np.isfinite(recorded).all():
-            print(f"  recorded: {tested(recorded, right)}")
+            print(f"  recorded: {tested(recorded, tests)}")
         found = reliability(said, right)
         for low, high, count, mean, share in zip(
             found.edges, found.edges[1:], found.count, found.confidence, found.accuracy, strict=False

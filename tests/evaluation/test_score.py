@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
 import cv2
 import numpy as np
@@ -14,9 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
+from tracking3d.results.files import write_mask
 from tracking3d.testing.synthesis.convex_clips import write_clip
 from tracking3d_bench.datasets.clip import read_truth
 from tracking3d_bench.datasets.run_answers import answers_of_run, is_refined
+from tracking3d_bench.datasets.truth import MaskFile
+from tracking3d_bench.evaluation.confidence_scores import frame_difficulties
 from tracking3d_bench.evaluation.mask_scores import MaskScores
 from tracking3d_bench.evaluation.pose_scores import PoseScores
 from tracking3d_bench.evaluation.score import Scores, score, score_run
@@ -664,3 +667,27 @@ def text_of(scores):
     console = Console(file=io.StringIO(), width=200)
     console.print(format_scores(scores))
     return console.file.getvalue()
+
+
+def test_a_frame_is_harder_with_less_texture_more_hidden_and_faster_motion(tmp_path):
+    """One texture, half of it hidden in frame 2, and 20 degrees between frames 2 and 3."""
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8), (160, 120))
+    faint = np.round(image / 16).astype(np.uint8)
+    mask = np.zeros((120, 160), bool)
+    mask[20:100, 20:140] = True
+    half = mask.copy()
+    half[:, 80:] = False
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[3, :3, :3] = Rotation.from_rotvec([0, np.radians(20), 0]).as_matrix()
+    write_clip(
+        tmp_path, np.stack([image, faint, image, image]), np.stack([mask] * 4), T, Camera.from_fov(160, 120),
+        source="t", note="",
+    )  # fmt: skip
+    truth = read_truth(tmp_path)
+    shown = tmp_path / "half.png"
+    write_mask(shown, half)
+    hard = frame_difficulties(replace(truth, visible_masks={2: MaskFile(shown)}))
+    assert hard[0] < hard[1]
+    assert hard[2] - hard[0] == pytest.approx(2, abs=0.5)
+    assert hard[3] - hard[0] == pytest.approx(2)

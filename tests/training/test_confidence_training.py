@@ -132,5 +132,5 @@ def test_with_balance_every_folder_is_tested_by_a_fit_on_the_others(script, benc
 
 
 def test_a_frame_of_a_large_group_counts_less(script):
-    frames = [script.Judged("s", group, {}, True) for group in "aaaab"]
+    frames = [script.Judged("s", group, {}, True, 0.0) for group in "aaaab"]
     assert script.balanced(frames).tolist() == [0.5, 0.5, 0.5, 0.5, 1.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from tracking3d.estimation.online.state.confidence import (
     PoseEvidence,
     _doubt,
     assess_pose,
+    confidence_features,
     is_misfit,
     likelihood,
     loss_excess,
@@ -148,7 +150,7 @@ def test_the_reason_names_what_speaks_most_against_the_pose():
         "too few inliers": (firm, PoseEvidence(0)),
         "hardly any texture": (firm, PoseEvidence(0, untextured=True)),
         "no points that last": (firm, PoseEvidence(0, untextured=True, has_texture=True)),
-        "too large": (replace(firm, points=0.9, overlap=0.8), PoseEvidence(100)),
+        "too many outliers": (replace(firm, overlap=1.0), PoseEvidence(400, outlier_ratio=0.3)),
         "rotation about camera axis (0.0, 1.0, 0.0)": (replace(loose, overlap=0.8), PoseEvidence(200)),
     }
     for words, (one, evidence) in against.items():
@@ -237,9 +239,31 @@ def test_a_good_fit_is_likely_right_and_each_contradiction_makes_it_less_so():
     assert likelihood(fit(overlap=0.5, unseen=0.3), PoseEvidence(0)) < 0.1
 
 
+@pytest.mark.parametrize("inliers", [40, 160])
+def test_the_deviation_is_that_of_poses_fitted_to_noisy_points(inliers):
+    """Rotation about one axis, by least squares: points 100 pixels away move by 1.75 pixels a degree."""
+    rng, scale, sigma, arm = np.random.default_rng(0), 2.0, 1.0, 100.0
+    residual = rng.normal(0, sigma, (2000, inliers, 2))
+    turned = np.degrees(residual[..., 0].mean(1) / arm)
+    loss = float(np.log1p((residual**2).sum(2) / (8 * scale) ** 2).mean()) * 64  # far inside the robust scale
+    cost = (arm * np.radians(10) / scale) ** 2  # of 10 degrees, of the mean over the points
+    said = confidence_features(
+        {"appearance": 0.2, "outline": 0.3, "points": loss},
+        {"inliers": inliers, "unseen_ratio": 0, "mask_iou": 1, "mask_confidence": 1, "min_curvature": cost},
+    )
+    assert math.exp(said["deviation"]) == pytest.approx(turned.std(), rel=0.15)
+
+
+def test_many_points_that_agree_loosely_are_tracked_where_a_rotation_is_cheap():
+    """A video of a thing that turns little: 165 inliers, no outliers, loss 0.7."""
+    cheap = replace(fit(overlap=0.95, points=0.7), information=30 * torch.eye(6))
+    assert assess_pose(cheap, USUAL, PoseEvidence(165)).status is Status.TRACKED
+    assert assess_pose(cheap, USUAL, PoseEvidence(16)).status is Status.UNCERTAIN
+
+
 def test_beyond_the_range_it_was_fitted_on_nothing_changes():
     assert likelihood(fit(overlap=0.4), PoseEvidence(9)) == likelihood(fit(overlap=0.0), PoseEvidence(9))
-    assert likelihood(fit(), PoseEvidence(400)) == likelihood(fit(), PoseEvidence(4000))
+    assert likelihood(fit(), PoseEvidence(4000)) == likelihood(fit(), PoseEvidence(40000))
 
 
 def test_after_a_loss_only_what_is_believed_is_the_object():

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
+from tracking3d.estimation.online.features.klt import texture_strength
+from tracking3d.video.image_file import read_image
 from tracking3d_bench.datasets.answers import Answers
+from tracking3d_bench.datasets.truth import Truth
 from tracking3d_bench.evaluation.calibration import (
     area_under_roc,
     detection_scores,
@@ -21,6 +26,10 @@ RIGHT_ROTATION, RIGHT_IOU = 10.0, 0.7
 
 LOST_ROTATION, LOST_IOU = 30.0, 0.3
 """A frame is truly lost above this rotation error in degrees or below this IoU."""
+
+_USUAL_TEXTURE = 4.0  # strength of a printed thing in good light; real ones have 3 and more
+_TEXTURES = 0.25, 16.0  # strengths beyond which it counts no further
+_USUAL_MOTION = 10.0  # degrees a frame that count as a halving of the texture does
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +74,31 @@ def right_frames(
         n: rotation.get(n, 0.0) < RIGHT_ROTATION and (n not in masks or masks[n].iou > RIGHT_IOU)
         for n in sorted((rotation.keys() | masks.keys()) - {answers.given})
     }
+
+
+def frame_difficulties(truth: Truth) -> dict[int, float]:
+    """How hard each frame with a known pose is, without any method's results: the calibration is told by it.
+
+    The sum of three numbers: how often the texture strength has been halved from that of a printed thing, the
+    share of the object that is hidden, in quarters, and the rotation since the frame before, in tens of degrees.
+    A number that is not known is 0. It was chosen before any calibration was measured by it, and fitted to nothing.
+    """
+    found = {}
+    for n in sorted(truth.T_cam_obj):
+        hard = 0.0
+        visible = truth.visible_masks.get(n, truth.masks.get(n))
+        if visible is not None:
+            seen = visible.read()
+            strength = texture_strength(cv2.cvtColor(read_image(truth.frames[n]), cv2.COLOR_RGB2GRAY), seen)
+            hard += math.log2(_USUAL_TEXTURE / min(max(strength, _TEXTURES[0]), _TEXTURES[1]))
+            whole = int(truth.masks[n].read().sum()) if n in truth.masks else 0
+            hard += 4 * max(0.0, 1 - float(seen.sum()) / whole) if whole else 0.0
+        if n - 1 in truth.T_cam_obj:
+            turn = truth.T_cam_obj[n][:3, :3] @ truth.T_cam_obj[n - 1][:3, :3].T
+            cosine = (np.trace(turn) - 1) / 2
+            hard += math.degrees(math.acos(min(max(cosine, -1.0), 1.0))) / _USUAL_MOTION
+        found[n] = hard
+    return found
 
 
 def score_confidence(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import Assessment, Status
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.optimization.pose_refinement import least_constrained_axis
+from tracking3d.estimation.online.optimization.pose_refinement import TURN, least_constrained_axis
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.frames import TRACKED_CONFIDENCE
@@ -21,25 +21,23 @@ ENOUGH_POINTS = 15
 _UNSEEN_CHARGE = PoseWeights().unseen
 _FULL_WEIGHT_TEXTURE = 0.8  # share of known texture from which the appearance counts in full
 _MOSTLY_UNSEEN = 0.7  # share of unseen texture
-_INTERCEPT = 0.957
+_INTERCEPT = 1.6
 _TERMS = {  # weight, and the range that was seen
     "missed": (-6.219, 0.0, 0.5394),
     "unseen_ratio": (-3.339, 0.00157, 0.5698),
-    "inliers": (0.4149, 0.0, 5.663),
     "outlier_ratio": (-0.6459, 0.0, 0.3333),
-    "points": (-1.686, 0.0, 0.9385),
-    "min_curvature": (0.4711, -2.815, 2.374),
+    "deviation": (-1.0, math.log(0.05), math.log(10.0)),
 }
+# What is rendered counts as four points with a loss of .3 (fitted): without inliers the curvature alone decides
+_RENDERED_POINTS, _RENDERED_LOSS = 4, 0.3
 # Intercept, and weight of the missed overlap, for a surface of revolution about a free axis, which cannot adapt to what
 # contradicts it: tracked from an overlap of .9 (chosen; of 102 keyframes of six maps, all above .89, one was wrong)
 _FREE_AXIS = (4.2, -28.0)
 _REASONS = {
     "missed": "the silhouette and the mask overlap too little (IoU {fit.overlap:.2f})",
     "unseen_ratio": "much of what is visible has not been seen before (ratio {fit.unseen:.2f})",
-    "inliers": "too few inliers ({evidence.inliers})",
     "outlier_ratio": "too many outliers (ratio {evidence.outlier_ratio:.2f})",
-    "points": "the reprojection errors of the inliers are too large (loss {fit.points:.2f})",
-    "min_curvature": "rotation about camera axis ({axis}) is poorly constrained",
+    "deviation": "rotation about camera axis ({axis}) is poorly constrained (loss {fit.points:.2f} of the inliers)",
 }
 _POINTS_ONLY = 0.73  # highest confidence if the points fit and the appearance does not
 _OUTLINE_ONLY = 0.5  # highest confidence if only the outline fits
@@ -105,17 +103,20 @@ def confidence_features(losses: Mapping[str, float], diagnostics: Mapping[str, f
 
     If the points tell that the mask is wrong, a contradiction with it is no evidence against a pose.
     """
-    known = 1 - diagnostics["unseen_ratio"]
+    known, inliers = 1 - diagnostics["unseen_ratio"], diagnostics["inliers"]
+    points = inliers + _RENDERED_POINTS
+    loss = (inliers * losses["points"] + _RENDERED_POINTS * _RENDERED_LOSS) / points
+    # Both residuals of a point share its loss; the curvature is of the mean over the points.
+    variance = loss / (2 * points * (diagnostics.get("min_curvature", 0.0) + 1e-3))
     compared = (losses["appearance"] - _UNSEEN_CHARGE * diagnostics["unseen_ratio"]) / max(known, 0.05)
     return {
         "appearance": min(max(compared, 0.0), 2.0),
         "outline": diagnostics["mask_confidence"] * losses["outline"],
         "missed": diagnostics["mask_confidence"] * (1 - diagnostics["mask_iou"]),
         "unseen_ratio": diagnostics["unseen_ratio"],
-        "inliers": math.log1p(diagnostics["inliers"]),
-        "min_curvature": math.log(diagnostics.get("min_curvature", 0.0) + 1e-3),
         "outlier_ratio": diagnostics.get("outlier_ratio", 0.0),
-        "points": losses["points"],
+        # logarithm of the standard deviation in degrees of the rotation about the least constrained axis
+        "deviation": math.log(TURN) + math.log(variance) / 2,
     }
 
 
@@ -164,9 +165,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 
     Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
-    of the suite ``fresh`` of seed 9101, and its intercept to further suites and real clips;
-    history/pages/method/confidence.md has its calibration on others.
-    Rotation about a free axis does not count.
+    of the suite ``fresh`` of seed 9101; intercept and deviation were fitted again to small turns and rests.
+    history/pages/method/confidence.md has its calibration on others. Rotation about a free axis does not count.
     """
     odds = _INTERCEPT + sum(_log_odds(fit, evidence).values())
     if evidence.free_axis is not None:
@@ -260,9 +260,11 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
     odds = _log_odds(fit, evidence)
     best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
     worst = max(odds, key=lambda name: best[name] - odds[name])
-    if worst == "inliers" and evidence.untextured:
+    if worst == "deviation" and evidence.untextured:
         found = "no points that last" if evidence.has_texture else "hardly any texture"
         return f"the object has {found}: its rotation is poorly constrained"
+    if worst == "deviation" and not evidence.is_decisive:
+        return f"too few inliers ({evidence.inliers})"
     axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
     return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)
 
