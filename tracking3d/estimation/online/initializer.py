@@ -435,7 +435,6 @@ def restart_if_misfit(state: Mapped, config: OnlineConfig) -> Mapped:
         trajectory=((last.pose, last.index),),
         baseline=LossBaseline(),
         lost_frames=0,
-        doubtful_frames=0,
         last_candidate=None,
         motion_references=(),
     )
