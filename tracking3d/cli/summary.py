@@ -75,8 +75,7 @@ def passes_in_words(run: Mapping[str, Any]) -> str:
     """
     over = (run.get("refinement") or {}).get("passed_over") or {}
     return ", ".join(
-        f"{name} {format_value(seconds)} s"
-        + (f" ({over[name]} frames passed over)" if over.get(name) else "")
+        f"{name} {seconds:.1f} s" + (f" ({over[name]} frames passed over)" if over.get(name) else "")
         for name, seconds in run["timings"].get("passes", {}).items()
     )
 
