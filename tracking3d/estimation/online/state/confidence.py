@@ -166,7 +166,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
 
     Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
     of the suite ``fresh`` of seed 9101; intercept and deviation were fitted again to small turns and rests.
-    history/pages/method/confidence.md has its calibration on others. Rotation about a free axis does not count.
+    history/2026-11-28-confidence-with-points.md has its calibration on others.
+    Rotation about a free axis does not count.
     """
     odds = _INTERCEPT + sum(_log_odds(fit, evidence).values())
     if evidence.free_axis is not None:
