@@ -95,4 +95,5 @@ def test_a_side_that_turns_into_view_at_once_is_taken_if_the_network_is_sure(
         masks.append(mask)
     segmentation = ColourSegmentation(images[0], (30, 40, 30, 40), masks[0], network=Network(masks[1], odds))
     found = segmentation.step(images[1]).binary
+    assert found is not None
     assert iou(found, masks[1 if taken else 0]) > 0.85
