@@ -1,14 +1,15 @@
-"""Holes of a mask: those that are the object itself are filled, those through which something else is seen are not."""
+"""Holes of a mask that are the object itself are filled, others are not; sides that turn into view are taken in."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
+from moving_shape import iou
 
 from tracking3d.geometry.camera import Window
-from tracking3d.scene.view import FrameCrop
-from tracking3d.trackers.segmentation import fill_own_holes
+from tracking3d.scene.view import FrameCrop, crop_window
+from tracking3d.trackers.segmentation import ColourSegmentation, fill_own_holes
 
 SIZE = 120
 SKIN, WOOD, METAL, WHITE = (200, 150, 130), (190, 170, 120), (110, 110, 115), (240, 240, 245)
@@ -66,3 +67,33 @@ def test_a_mask_without_holes_stays_as_it_is() -> None:
     nothing = np.zeros((SIZE, SIZE), np.float32)
     for one in (mask, ~mask, np.zeros_like(mask), np.ones_like(mask)):
         assert np.array_equal(fill_own_holes(one, crop, nothing, nothing > 0), one)
+
+
+class Network:
+    """Says where the object is as it is told, and that nothing is in front of it."""
+
+    def __init__(self, truth: np.ndarray, odds: float) -> None:
+        self.truth, self.odds = truth, odds
+
+    def log_odds(self, image, present, motion, colours, last):  # type: ignore[no-untyped-def]
+        where = crop_window(self.truth, present.window) > 0.5
+        return np.where(where, self.odds, -4).astype(np.float32), np.full(where.shape, -4, np.float32)
+
+
+@pytest.mark.parametrize(("odds", "taken"), [(4.0, True), (1.5, False)])
+def test_a_side_that_turns_into_view_at_once_is_taken_if_the_network_is_sure(
+    odds: float, taken: bool
+) -> None:
+    """A mask that grows by more than a third is refused otherwise."""
+    noise = np.random.default_rng(0).normal(0, 3, (SIZE, SIZE, 3))
+    images, masks = [], []
+    for right in (60, 90):
+        mask = np.zeros((SIZE, SIZE), bool)
+        mask[40:80, 30:right] = True
+        image = np.where(mask[..., None], WHITE, WOOD) + noise
+        images.append(image.clip(0, 255).astype(np.uint8))
+        masks.append(mask)
+    segmentation = ColourSegmentation(images[0], (30, 40, 30, 40), masks[0], network=Network(masks[1], odds))
+    found = segmentation.step(images[1]).binary
+    assert found is not None
+    assert iou(found, masks[1 if taken else 0]) > 0.85

@@ -36,6 +36,9 @@ SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
 
 _MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
 _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not trusted
+_TOLD, _COLOURED = 2.0, 0.5
+"""Mean log-odds of the network, 4 at most, and of the colours, 3 at most, from which a larger mask is trusted: a side
+has turned into view at once (chosen)."""
 _LEAST_PART = 0.1  # of the usual area; less than this at the frame's border counts as not visible
 _LEAST_PIXELS = 9  # of the crop; fewer are no mask
 _PATIENCE = 3  # doubtful frames in a row before each attempt to re-initialize
@@ -204,6 +207,10 @@ class ColourSegmentation:
         believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
         if not believed and at_border:  # an object that comes or goes changes its area fast: colours decide
             believed = self._separation(present, mask) > self._separation(present, moved)
+        if not believed and self._network is not None and np.count_nonzero(mask) > area:
+            grown = mask & ~moved
+            both = said[grown].mean() / _TOLD, self._colours.log_ratio(present.lab)[grown].mean() / _COLOURED
+            believed = bool(min(both) > 1)
         mask = mask if believed else moved
         if self._network is not None:
             mask = fill_own_holes(mask, present, along, occluder > 0)
