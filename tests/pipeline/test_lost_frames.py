@@ -13,7 +13,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline import lost_frames
-from tracking3d.pipeline.lost_frames import SecondStart, TriedFrames, may_win, plan_gaps
+from tracking3d.pipeline.lost_frames import SecondStart, may_win, plan_gaps
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import Session
 from tracking3d.results.files import write_image
@@ -157,12 +157,11 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
     assert "A start in frame 5 explains" in caplog.text
 
 
-def test_all_tries_together_take_no_more_frames_than_the_video_has():
-    tried = TriedFrames(5, {"while tracking": 1})
-    assert list(tried.take("gaps", range(3))) == [0, 1, 2]
-    assert list(tried.take("gaps", range(3))) == [0]
-    assert list(tried.take("gaps", range(3))) == []
-    assert tried.by == {"while tracking": 1, "gaps": 4}
+def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
+    monkeypatch.setattr(Session, "tried", FRAMES - 2)
+    lose(monkeypatch, {12, 13, 14, 15})
+    tried = run(video, tmp_path / "run").description["refinement"]["start"]["tried"]
+    assert tried == {"while tracking": FRAMES - 2, "gaps": 2}
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ wide steps, or in no order, are joined as photos. All of it together has a budge
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from typing import TypeVar
@@ -46,19 +47,17 @@ class TriedFrames:
     """
 
     most: int  # frames of the video
-    by: dict[str, int] = field(default_factory=dict)  # frames that were tried, by what
+    by: Counter[str]  # frames that were tried, by what
 
     @property
     def left(self) -> int:
         """Frames that may still be tried."""
         return self.most - sum(self.by.values())
 
-    def take(self, what: str, frames: Iterable[T], limited: bool = True) -> Iterator[T]:
-        """The same frames, as long as some are left."""
+    def count(self, what: str, frames: Iterable[T]) -> Iterator[T]:
+        """The same frames, counted as they are taken."""
         for one in frames:
-            if limited and self.left <= 0:
-                return
-            self.by[what] = self.by.get(what, 0) + 1
+            self.by[what] += 1
             yield one
 
 
@@ -73,9 +72,9 @@ def explain_lost_frames(session: Session, source: FrameSource, masks: SavedMasks
     Returns:
         Where the model that is to be refined started.
     """
-    tried = TriedFrames(len(masks.estimates.causal), {"while tracking": session.tried})
+    tried = TriedFrames(len(masks.estimates.causal), Counter({"while tracking": session.tried}))
     start = _find_start_of_model(session, source, masks, tried)
-    return replace(start, tried={what: frames for what, frames in tried.by.items() if frames})
+    return replace(start, tried=dict(+tried.by))
 
 
 def _find_start_of_model(
@@ -132,7 +131,7 @@ def start_from_photos(
     def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
         wanted = frozenset(indices)
         frames = (frame for frame in read_again(source) if frame.index in wanted)
-        return masks.with_masks(tried.take("photos", frames, limited=False))
+        return masks.with_masks(tried.count("photos", frames))
 
     report_progress("joining photos")
     seen = tuple(sorted(index for index in causal if masks.has_mask(index)))
@@ -198,7 +197,7 @@ def try_second_start(
     with closing(every) as frames_both_ways:
         wanted = (frame for frame in frames_both_ways if isinstance(frame, Frame))
         known = (frame for frame in wanted if frame.index in masks.estimates.causal)
-        shown = masks.with_masks(tried.take("second start", known, limited=False))
+        shown = masks.with_masks(tried.count("second start", known))
         attempt = session.attempt(shown, lambda now: may_win(now, gaps.confidence, frames, tried.left))
     if attempt is None:
         return None
@@ -209,14 +208,7 @@ def try_second_start(
 
 
 def may_win(now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int) -> bool:
-    """Whether a second start goes on.
-
-    Args:
-        now: The confidence in each frame that it was shown, by index.
-        before: That of the first start in all frames.
-        frames: How many there are.
-        left: How many may still be tried.
-    """
+    """Whether a second start goes on, by the confidence in each frame now and with the first start, by index."""
     explained = _explained(now)
     if explained and explained + frames - len(now) <= _MIN_GAIN * _explained(before):
         return False
@@ -306,7 +298,7 @@ class GapTracker:
         with closing(self._frames(backwards)) as frames:
             for frame in frames:
                 if length := gaps.pop(frame.index, 0):
-                    inside = self._tried.take("gaps", islice(frames, length))
+                    inside = self._tried.count("gaps", islice(frames, min(length, max(self._tried.left, 0))))
                     self._extend(Gap(frame, self._masks.with_masks(inside), backwards))
                 if not gaps or self._tried.left <= 0:
                     return
