@@ -30,28 +30,28 @@ FULLER_FOLDERS = {"export": 32}
 ROOM_LINES = {
     "__main__": 50,
     "batch": 2200,
-    "cli": 4850,
+    "cli": 4870,  # points in another run, passes
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 13900,
+    "estimation": 13960,  # rotations that go on or come back
     "export": 2750,
     "features": 1350,
     "frames": 150,
     "geometry": 2000,
     "modules": 450,
-    "pipeline": 6650,
+    "pipeline": 6750,  # the budget of what is tried when frames are lost
     "plugins": 800,
     "points": 3600,
-    "reconstruction": 3800,
+    "reconstruction": 3850,
     "rendering": 3800,
-    "results": 6750,
+    "results": 6900,
     "runtime": 1150,
     "scene": 350,
     "testing": 1100,
-    "trackers": 6250,
+    "trackers": 6300,  # holes of masks
     "ui": 5100,
-    "video": 2500,
+    "video": 2550,
 }
 """Lines that a room may have: today's, in fifties. Who needs more raises it in the same commit, and says why."""
 

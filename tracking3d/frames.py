@@ -56,10 +56,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class SkippedFrame:
-    """A frame that the source could not decode; the run goes on without it and records why."""
+    """A frame that the source could not decode, or whose picture came before; the run goes on without it."""
 
     index: int
     reason: str
+    # index of the frame before whose picture this one repeats to the bit; None if there was nothing to be used
+    repeats: int | None = None
+    time: float | None = None  # of a repeated picture, as in `Frame`
+    name: str = ""  # the same
 
 
 @dataclass(frozen=True, eq=False)

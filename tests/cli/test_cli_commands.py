@@ -266,6 +266,18 @@ def test_points_beside_the_object_are_followed_in_the_images_with_any(call, fini
     assert json.loads(quiet.stdout)["kind"] == ["image"]
 
 
+def test_points_are_followed_in_another_run_too(call, finished):
+    """Here the run itself."""
+    result = call("points", finished, "--xy", "31.5,23.5", "--in", finished, "--frame", 1, "--quiet")
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["run"] for row in rows] == ["0"] * 5 + ["1"] * 5
+    for here, there in zip(rows[:5], rows[5:], strict=True):
+        assert float(here["x"]) == pytest.approx(float(there["x"]), abs=0.5)
+        assert here["frame"] == there["frame"]
+    refused = call("points", finished, "--xy", "31.5,23.5", "--in", finished, "--any")
+    assert refused.exit_code == 2 and "leave out --any and --by-mesh" in refused.stderr
+
+
 def test_points_of_a_grid_are_drawn_and_need_no_video_by_mesh(call, finished):
     result = call("points", finished, "--grid", 8, "--frame", 2, "--video", "trails.mp4", "--quiet")
     assert (result.exit_code, result.stdout) == (0, "")

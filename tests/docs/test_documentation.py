@@ -184,7 +184,7 @@ def test_run_folder_page_names_every_file_and_key():
     files = [value for value in names if value.isprintable()]  # what sentences call arguments is not
     renderer = prepare_backend("auto", "cpu")
     start = description_at_start(RunHeader({}, Camera.from_fov(4, 4), "", 0, None, None, renderer=renderer))
-    end = summary([], 0, 0.0)
+    end = summary([], 0, {})
     keys = {
         *start,
         *start["versions"],

@@ -13,7 +13,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline import lost_frames
-from tracking3d.pipeline.lost_frames import SecondStart, plan_gaps
+from tracking3d.pipeline.lost_frames import SecondStart, may_win, plan_gaps
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import Session
 from tracking3d.results.files import write_image
@@ -130,8 +130,10 @@ def test_frames_that_were_lost_are_found_from_both_sides_before_the_refinement(m
         "start_from",
         lambda self, state, poses: given.update(poses) or start_from(self, state, poses),
     )
-    refined = run(video, tmp_path / "run").frames
+    reader = run(video, tmp_path / "run")
+    refined, tried = reader.frames, reader.description["refinement"]["start"]["tried"]
     assert {12, 13, 14, 15} <= set(given)
+    assert list(tried) == ["gaps"] and 4 <= tried["gaps"] <= FRAMES
     assert rotation_errors({one.index: one.T_cam_obj for one in refined}).max() < 8
 
 
@@ -153,6 +155,32 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
     with caplog.at_level("INFO"):
         run(video, tmp_path / "run")
     assert "A start in frame 5 explains" in caplog.text
+
+
+def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
+    monkeypatch.setattr(Session, "tried", FRAMES - 2)
+    lose(monkeypatch, {12, 13, 14, 15})
+    tried = run(video, tmp_path / "run").description["refinement"]["start"]["tried"]
+    assert tried == {"while tracking": FRAMES - 2, "gaps": 2}
+
+
+@pytest.mark.parametrize(
+    ("explained", "shown", "left", "goes_on"),
+    [
+        (0, 10, 5, True),  # there is no map yet
+        (0, 10, 0, False),
+        (10, 15, 5, True),
+        (2, 15, 5, False),  # with the other five it would not be enough
+        (6, 10, 0, True),  # the first start explains five of these ten
+        (5, 10, 0, False),
+    ],
+)
+def test_a_second_start_ends_when_it_cannot_win_or_is_behind_at_the_end_of_the_budget(
+    explained, shown, left, goes_on
+):
+    before = {n: float(n % 2) for n in range(20)}
+    now = {n: float(n < explained) for n in range(shown)}
+    assert may_win(now, before, 20, left) is goes_on
 
 
 @pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])

@@ -10,6 +10,7 @@ import pytest
 from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d import Status, load_config
+from tracking3d.cli.summary import passes_in_words
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.refinement_steps import RefinementSteps
 from tracking3d.pipeline.session import SOLVERS, Session
@@ -96,6 +97,11 @@ def test_only_frames_that_are_doubtful_or_that_the_adjustment_contradicts_are_es
     estimated = run(clip, images, tmp_path / "run")
     assert again == [DOUBTFUL, MOVED]
     assert estimated.description["refinement"]["passed_over"]["retracking"] == FRAMES - 2
+    timings = estimated.description["timings"]
+    passes = ["tracking", "lost frames", "map", "retracking", "landmarks", "poses", "model"]
+    assert list(timings["passes"]) == passes
+    assert sum(timings["passes"].values()) == pytest.approx(timings["seconds_total"])
+    assert f"({FRAMES - 2} frames passed over)" in passes_in_words(estimated.description)
     for one, causal in zip(estimated.frames, RunReader(tmp_path / "run", refined=False).frames, strict=True):
         assert one.refined and one.keyframe == causal.keyframe
         kept = one.index not in again

@@ -198,6 +198,35 @@ def test_runs_that_are_put_into_metres_later_keep_their_similarity(two_runs, tmp
     np.testing.assert_allclose(found.translation, factor * np.array([0.1, 0.2, 0.3]))
 
 
+def test_two_runs_share_coordinates_if_their_objects_have_one_origin(two_runs, tmp_path):
+    names = ("first", "extending", "known", "known_again", "stranger")
+    first, extending, known, again, stranger = (shutil.copytree(two_runs[1], tmp_path / one) for one in names)
+    to_extending = {"R": TO_OWN.R.tolist(), "scale": 1.7, "translation": TO_OWN.translation.tolist()}
+    noted(extending, {"run": str(first), **to_extending})
+    for run in (known, again):
+        description = json.loads((run / "run.json").read_text())
+        description["config"] = {"object": {"model": str(first)}}
+        (run / "run.json").write_text(json.dumps(description))
+
+    def between(one, other):
+        return extension.between_runs(RunReader(one), RunReader(other))
+
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    for one, other, expected in (
+        (known, again, points),
+        (first, extending, TO_OWN.points(points)),
+        (extending, known, TO_OWN.inverse.points(points)),
+        (known, known, points),
+    ):
+        np.testing.assert_allclose(between(one, other).points(points), expected, atol=1e-9)
+    with pytest.raises(InputError, match="share no object"):
+        between(known, stranger)
+    scale_run(first, 0.5)  # into metres, after the others were tracked
+    factor = unit_scale(RunReader(first))
+    np.testing.assert_allclose(between(known, first).points(points), factor * points)
+    np.testing.assert_allclose(between(known, extending).points(points), TO_OWN.points(points))
+
+
 def test_a_video_that_is_not_there_is_said_before_anything_is_tracked(two_runs, tmp_path):
     earlier = shutil.copytree(two_runs[1], tmp_path / "earlier")
     description = json.loads((earlier / "run.json").read_text())

@@ -61,13 +61,12 @@ def test_nothing_is_done_where_nothing_is_asked(run, monkeypatch):
     assert described(run) == {"state": "finished"}
 
 
-def records(count, degrees, refined=True, status="tracked"):
+def records(count, degrees, refined=True, status="tracked", free_axis=None):
     """Frames that turn by so many degrees in all."""
     turns = np.radians(np.linspace(0, degrees, count))
     poses = [Rotation.from_rotvec([0, turn, 0]).as_matrix() for turn in turns]
-    return [
-        SimpleNamespace(T_cam_obj=np.pad(R, (0, 1)), refined=refined, status=Status(status)) for R in poses
-    ]
+    said = {"refined": refined, "status": Status(status), "free_axis": free_axis}
+    return [SimpleNamespace(T_cam_obj=np.pad(R, (0, 1)), **said) for R in poses]
 
 
 @pytest.mark.parametrize(
@@ -75,6 +74,7 @@ def records(count, degrees, refined=True, status="tracked"):
     [
         (records(12, 40), {}, VIDEO, True),
         (records(12, 15), {}, VIDEO, False),
+        (records(12, 40, free_axis=(0.0, 1.0, 0.0)), {}, VIDEO, False),
         (records(7, 40), {}, VIDEO, False),
         (records(12, 40, refined=False), {}, VIDEO, False),
         (records(12, 40, status="uncertain"), {}, VIDEO, False),

@@ -134,6 +134,19 @@ def test_a_lens_that_a_few_views_from_one_side_do_not_tell_is_the_default_one(fa
     assert moved[2, 3] == pytest.approx(true[3, 2, 3] * default.fy / CAMERA.fy, rel=0.05)
 
 
+@pytest.mark.parametrize(("span", "fov"), [(40.0, DEFAULT_FIELD_OF_VIEW), (100.0, CAMERA.fov)])
+def test_views_from_sides_apart_may_speak_against_the_default_lens(monkeypatch, span, fov):
+    """However well they tell which one it is instead."""
+    monkeypatch.setattr(global_adjustment, "LENS_KNOWN", 0.0)
+    true = [pose(yaw, 0.2 * yaw) for yaw in np.linspace(-span / 2, span / 2, 9)]
+    look = GlobalAdjustment(ball(), replace(CAMERA, assumed=True), range(9), 20)
+    for index, T in enumerate(true):
+        look.see(answer(index, T), *seen(T, pattern()))
+    look.settle()
+    assert 0 < look.camera.focal_deviation < 0.1
+    assert look.camera.fov == pytest.approx(fov, rel=0.1)
+
+
 def test_a_lost_frame_is_not_looked_at_but_goes_on_from_the_view_before_to_the_one_after():
     off = disturbed()
     look = GlobalAdjustment(ball(), CAMERA, range(9), 20)

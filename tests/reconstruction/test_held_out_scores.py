@@ -10,10 +10,10 @@ from rendered_views import ball, pattern, pose, seen, view
 from test_volume import CAMERA, shape_views
 
 from tracking3d.reconstruction import bake_texture
-from tracking3d.reconstruction import held_out_test as module
-from tracking3d.reconstruction.held_out_test import held_out_scores
 from tracking3d.reconstruction.views import shape_view
 from tracking3d.scene.view import ObjectView
+from tracking3d_bench.evaluation import held_out_frames as module
+from tracking3d_bench.evaluation.held_out_frames import held_out_scores
 
 pytest.importorskip("skimage", reason="the extra model is not installed")
 

@@ -221,7 +221,7 @@ def test_the_sheet_has_crops_texture_mesh_and_figures(turning_sphere, count, row
     for index in range(count):
         estimate = dataclasses.replace(turning_sphere.estimates[0], index=index, keyframe=index == 1)
         thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, estimate)
-    figures = summary([], 0, 0.0)
+    figures = summary([], 0, {})
     sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, figures)
     assert sheet.shape == (rows * TILE, COLUMNS * TILE, 3)
     framed = [tuple(sheet[1, column * TILE + 1]) == drawing.KEYFRAME for column in range(COLUMNS)]
@@ -234,7 +234,7 @@ def test_the_sheet_shows_the_model_from_sides_of_tracked_frames_only(turning_sph
         for number, status in enumerate(statuses):
             estimate = dataclasses.replace(turning_sphere.estimates[number], status=status)
             thumbnails.add(overlay_of(turning_sphere, number)[:240], 2.0, estimate)
-        sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, summary([], 0, 0.0))
+        sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, summary([], 0, {}))
         row = sheet[-TILE:, TILE:-TILE]
         return [row[:, n * TILE : (n + 1) * TILE] for n in range(COLUMNS - 2)]
 
@@ -248,7 +248,7 @@ def test_the_sheet_says_which_crops_show_an_answer_that_was_replaced(turning_sph
     thumbnails = Thumbnails()
     thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, turning_sphere.estimates[0])
     sheets = [
-        draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, 0.0), replaced)
+        draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, {}), replaced)
         for replaced in ({0}, {1}, set())
     ]
     assert np.array_equal(sheets[1], sheets[2])
@@ -260,7 +260,7 @@ def test_the_sheet_says_which_crops_show_an_answer_that_was_replaced(turning_sph
 def test_the_sheet_of_a_run_without_a_mesh_has_no_mesh(turning_sphere):
     thumbnails = Thumbnails()
     thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, turning_sphere.estimates[0])
-    sheet = draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, 0.0))
+    sheet = draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, {}))
     assert sheet.shape[0] == 2 * TILE
     assert (sheet[TILE:, TILE:] == drawing.PAPER).all()
 

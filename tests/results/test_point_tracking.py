@@ -11,11 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.results import layout
 from tracking3d.results.correspondences import (
     COLUMNS,
     grid_on_object,
     points_to_csv,
+    points_to_json,
     project_object_points,
     track_points,
 )
@@ -170,3 +172,42 @@ def test_estimates_that_landmarks_adjusted_are_taken_as_they_are(shaken, tmp_pat
     assert {progress.name for progress in heard} == {"reading frames"}
     for view, record in zip(taken.scene.views, RunReader(run).frames, strict=True):
         assert np.allclose(view.T_cam_obj, record.T_cam_obj)
+
+
+TO_OTHER = Similarity(
+    Rotation.from_euler("xyz", [40, -70, 20], degrees=True).as_matrix(), 1.7, np.array([0.3, -0.2, 0.5])
+)
+
+
+@pytest.mark.parametrize("frames", [slice(2, 10), slice(4, None, -1)], ids=["forwards", "backwards"])
+def test_points_are_found_in_another_run_of_the_object(
+    shaken, scene, make_turning_sphere, write_run, tmp_path, frames
+):
+    """Its object coordinates, pictures and first view are others; its poses are right, those of the run are off."""
+    folder, clip, truth = shaken
+    other = make_turning_sphere(12, step=5.0)
+    shown = [dataclasses.replace(one, index=n) for n, one in enumerate(other.frames[frames])]
+    poses = [one.T_cam_obj for one in other.estimates[frames]]
+    estimates = [
+        dataclasses.replace(one, index=n, T_cam_obj=TO_OTHER.poses(one.T_cam_obj[None])[0])
+        for n, one in enumerate(other.estimates[frames])
+    ]
+    model = dataclasses.replace(other.model, vertices=TO_OTHER.points(other.model.vertices))
+    write_run(tmp_path / "other", dataclasses.replace(other, model=model, frames=shown, estimates=estimates))
+    there = open_scene(tmp_path / "other", open_source([one.image for one in shown]))
+    xy = np.array(grid_on_object(RunReader(folder), 0, 8))
+    found = scene.track_in(there, TO_OTHER, 0, xy)
+    expected = true_positions(clip, [truth[0], *poses], xy)[1:]
+    assert found.on_object.all() and list(found.frames) == list(range(len(shown)))
+    error = np.linalg.norm(found.positions - expected, axis=2)[found.visible]
+    assert found.visible.mean() > 0.8 and np.median(error) < 0.5  # 1.5 degrees are .8
+    radii = np.linalg.norm(TO_OTHER.inverse.points(found.points), axis=1)
+    np.testing.assert_allclose(radii, 1, atol=0.1)
+
+    own = scene.track(0, xy)
+    rows = list(csv.DictReader(io.StringIO(points_to_csv(own, found))))
+    assert [row["run"] for row in rows] == ["0"] * own.visible.size + ["1"] * found.visible.size
+    assert float(rows[-1]["x"]) == pytest.approx(found.positions[-1, -1, 0], abs=1e-3)
+    assert json.loads(points_to_json(own, found))["other"]["visible"] == found.visible.tolist()
+    with pytest.raises(InputError, match="no frame 99"):
+        scene.track_in(there, TO_OTHER, 99, xy)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -170,6 +172,28 @@ def test_without_a_35_mm_length_the_sensor_s_resolution_counts_for_the_size_that
     source = open_source(tmp_path)
     assert source.intrinsics[0] == source.intrinsics[1] == pytest.approx(expected, rel=1e-4)
     assert "5.40625 mm by the sensor's resolution" in source.intrinsics_origin
+
+
+@pytest.mark.parametrize(("model", "known"), [("COOLPIX P60\0", True), ("COOLPIX P61", False)])
+def test_without_both_a_known_camera_s_sensor_counts(tmp_path, monkeypatch, model, known) -> None:
+    """By a stand-in for lensfunpy, whose data base has this camera with this crop factor."""
+
+    class Database:
+        def find_cameras(self, maker: str, model: str) -> list[SimpleNamespace]:
+            return [SimpleNamespace(crop_factor=5.62)] if (maker, model) == ("NIKON", "COOLPIX P60") else []
+
+    monkeypatch.setitem(sys.modules, "lensfunpy", SimpleNamespace(Database=Database))
+    exif = Pillow.Exif()
+    exif.update({0x010F: "NIKON", 0x0110: model})
+    exif.get_ifd(0x8769)[0x920A] = 6.4
+    Pillow.new("RGB", (400, 300)).save(tmp_path / "1.jpg", exif=exif)
+    source = open_source(tmp_path)
+    assert (source.intrinsics is not None) == known
+    if known:
+        assert source.intrinsics[0] == pytest.approx(6.4 * 5.62 * 500 / math.hypot(36, 24))
+        assert "6.4 mm by the sensor's size in lensfun" in source.intrinsics_origin
+    monkeypatch.setitem(sys.modules, "lensfunpy", None)  # is not installed
+    assert open_source(tmp_path).intrinsics is None
 
 
 @pytest.mark.parametrize("focal_length", [None, 0])

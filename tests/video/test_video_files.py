@@ -14,8 +14,9 @@ import pytest
 from sample_videos import damage_packet, encode_video, moving_picture, shown_numbers
 
 from tracking3d.errors import InputError
-from tracking3d.frames import SkippedFrame
+from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video import FrameSource, open_source
+from tracking3d.video.opening import without_repeats
 
 Clip = Callable[..., Path]
 
@@ -291,3 +292,15 @@ def test_a_real_video(shared_data: Path) -> None:
     assert [frame.index for frame in frames] == [0, 5, 10, 15]
     assert [frame.time for frame in frames] == pytest.approx([0, 1 / 6, 1 / 3, 1 / 2])
     assert {frame.size for frame in frames} == {(480, 640)}
+
+
+def test_repeated_pictures_of_a_video_are_skipped_where_that_is_asked_for(tmp_path: Path) -> None:
+    shown = [moving_picture(number) for number in (0, 0, 1, 1, 1, 0)]
+    shown[4] = shown[4].copy()
+    shown[4][5, 7] ^= 1  # which is another picture
+    source = open_source(encode_video(tmp_path / "still.mkv", shown, codec="ffv1", pix_fmt="bgr0"))
+    assert all(isinstance(frame, Frame) for frame in source)
+    for used, repeats in (((), {1: 0, 3: 2}), ([3], {1: 0})):
+        frames = list(without_repeats(source, used))
+        assert {one.index: one.repeats for one in frames if isinstance(one, SkippedFrame)} == repeats
+        assert [one.time for one in frames] == pytest.approx([index / 10 for index in range(6)])

@@ -65,14 +65,13 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
     about = run.description
     counts, (per_frame, _) = about["counts"], time_per_frame(about)
     confidences = [record.confidence for record in run.frames]
-    refinement = (about.get("refinement") or {}).get("seconds") or 0.0
     return {
         "run": name,
         "video": job.video,
         **{key: counts[key] for key in ("frames", "tracked", "uncertain", "lost", "skipped")},
         "confidence": float(np.mean(confidences)) if confidences else None,
         "iou_initial": about.get("iou_initial_mean"),
-        "seconds": about["timings"]["seconds_total"] + refinement,
+        "seconds": about["timings"]["seconds_total"],
         "seconds_per_frame": per_frame,
         "peak_memory_mb": about.get("peak_memory_mb"),
         "tracker": run.config["tracker"]["name"],

@@ -15,6 +15,7 @@ from tracking3d.cli.options.output import ObjectSize
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
+    from tracking3d.geometry.similarity import Similarity
     from tracking3d.results.correspondences import PointTracks
     from tracking3d.results.run_reader import RunReader
     from tracking3d.video import FrameSource
@@ -71,6 +72,15 @@ class QueryOptions:
             rich_help_panel=_QUERY,
         ),
     ] = False
+    other: Annotated[
+        Path | None,
+        typer.Option(
+            "--in",
+            metavar="RUN",
+            help="Track the points in another run of the same object, too, for example one with --object of this run.",
+            rich_help_panel=_QUERY,
+        ),
+    ] = None
     source: Video = None
     object_size: ObjectSize = None
 
@@ -88,6 +98,10 @@ class QueryOptions:
         if self.any_pixel and self.by_mesh:
             raise InputError(
                 "--any tracks points in the images, which --by-mesh does not read; leave out one of them."
+            )
+        if self.other is not None and (self.any_pixel or self.by_mesh):
+            raise InputError(
+                "--in tracks points of the object by the images of both runs; leave out --any and --by-mesh."
             )
         return pixels
 
@@ -122,7 +136,8 @@ def points(
     from tracking3d.results.layout import check_run_folder
 
     pixels = query.pixels()
-    check_run_folder(run)
+    for folder in (run, *([query.other] if query.other else ())):
+        check_run_folder(folder)
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
             raise OutputError(
@@ -131,6 +146,7 @@ def points(
     from tracking3d.cli.progress import load_with_progress, plan_points, show_progress
 
     load_with_progress("tracking3d.results.point_tracking", quiet, kernels=True)
+    from tracking3d.reconstruction.extension import between_runs
     from tracking3d.results.correspondences import grid_on_object, track_points
     from tracking3d.results.run_reader import RunReader
 
@@ -139,20 +155,26 @@ def points(
     if query.grid is not None:
         pixels += grid_on_object(reader, query.frame, query.grid)
     tracks = track_points(reader, query.frame, pixels)  # before the video is read: it may refuse the query
+    other: tuple[RunReader, Similarity] | None = None
+    if query.other is not None:
+        there = RunReader(query.other, refined=not query.causal)
+        other = there, between_runs(reader, there)
     images: FrameSource | None = None
     if not query.by_mesh or video is not None:
-        needed = query.any_pixel or query.source is not None or video is not None
+        needed = query.any_pixel or query.source is not None or video is not None or other is not None
         images = _images(reader, query.source, needed)
     with show_progress(quiet, plan_points(len(reader.frames))):
-        tracks, remarks = _followed(reader, query, pixels, tracks, images, quiet)
-    for remark in remarks:
+        tracks, in_other, remarks = _followed(reader, query, pixels, tracks, images, other)
+    for remark in filter(None, remarks[:-1] if quiet else remarks):
         typer.echo(remark, err=True)
     if scale is not None:
         tracks = replace(tracks, points=tracks.points * scale)
+        if in_other is not None and other is not None:
+            in_other = replace(in_other, points=in_other.points * scale / other[1].scale)
     with show_progress(quiet):
-        _write_files(tracks, images, csv, video)
+        _write_files(tracks, in_other, images, csv, video)
     if as_json or (csv is None and video is None):
-        _print(tracks, as_json)
+        _print(tracks, as_json, in_other)
 
 
 def _scale(reader: RunReader, object_size: float | None) -> float | None:
@@ -171,12 +193,13 @@ def _followed(
     pixels: list[tuple[float, ...]],
     tracks: PointTracks,
     images: FrameSource | None,
-    quiet: bool,
-) -> tuple[PointTracks, list[str]]:
-    """The tracks that the images correct, if they are read, and what to print about them."""
+    other: tuple[RunReader, Similarity] | None,
+) -> tuple[PointTracks, PointTracks | None, list[str]]:
+    """The tracks that the images correct, if they are read, those in the other run, and what to print about them."""
     from tracking3d.results.correspondences import check_asked, on_mask
     from tracking3d.results.point_tracking import open_scene
 
+    in_other: PointTracks | None = None
     by_images = images is not None and not query.by_mesh
     covered = tracks.on_object | query.any_pixel
     if by_images:
@@ -184,40 +207,46 @@ def _followed(
     otherwise = "" if query.by_mesh else ", or --any to follow them in the images alone"
     remarks = [reader.not_finished, check_asked(tracks, reader.camera, covered, otherwise)]
     if images is not None and by_images:
-        tracks = open_scene(reader, images).track(query.frame, pixels, query.any_pixel)
-        if not quiet:
-            remarks.append(_by_images(tracks))
-    return tracks, [remark for remark in remarks if remark]
+        scene = open_scene(reader, images)
+        tracks = scene.track(query.frame, pixels, query.any_pixel)
+        if other is not None:
+            remarks.append(other[0].not_finished)
+            in_other = scene.track_in(open_scene(other[0]), other[1], query.frame, pixels)
+    return tracks, in_other, [*filter(None, remarks), _by_images(tracks)]
 
 
 def _write_files(
-    tracks: PointTracks, images: FrameSource | None, csv: Path | None, video: Path | None
+    tracks: PointTracks,
+    there: PointTracks | None,
+    images: FrameSource | None,
+    csv: Path | None,
+    video: Path | None,
 ) -> None:
     from tracking3d.results.correspondences import points_to_csv
     from tracking3d.results.point_trails import write_trails
 
     if csv is not None:
         try:
-            csv.write_text(points_to_csv(tracks), encoding="utf-8")
+            csv.write_text(points_to_csv(tracks, there), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{csv} cannot be written: {error.strerror}.") from error
     if video is not None and images is not None:
         write_trails(video, images, tracks, images.fps or _RATE)
 
 
-def _print(tracks: PointTracks, as_json: bool) -> None:
+def _print(tracks: PointTracks, as_json: bool, there: PointTracks | None = None) -> None:
     from tracking3d.results.correspondences import points_to_csv, points_to_json
 
     if as_json:
-        typer.echo(points_to_json(tracks))
+        typer.echo(points_to_json(tracks, there))
     elif not sys.stdout.isatty():
-        typer.echo(points_to_csv(tracks), nl=False)
+        typer.echo(points_to_csv(tracks, there), nl=False)
     else:
         from rich.table import Table
 
         from tracking3d.cli.tables import print_table
 
-        heads, *rows = (line.split(",") for line in points_to_csv(tracks).splitlines())
+        heads, *rows = (line.split(",") for line in points_to_csv(tracks, there).splitlines())
         table = Table(*heads)
         for row in rows:
             table.add_row(*row)

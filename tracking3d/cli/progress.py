@@ -217,6 +217,8 @@ def _describe(frame: FrameRecord | SkippedFrame) -> str:
     from tracking3d.frames import SkippedFrame
 
     if isinstance(frame, SkippedFrame):
+        if frame.repeats is not None:
+            return f"frame {frame.index} {frame.reason}"
         return f"[red]frame {frame.index} skipped[/]"
     colour, iou = _COLOURS[frame.status], format_value(frame.iou_initial)
     return f"frame {frame.index} [{colour}]{frame.status}[/] IoU {iou} {frame.seconds:.2f} s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,6 +62,7 @@ def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], List
     Raises:
         KeyboardInterrupt: If the writing of the report was interrupted.
     """
+    from tracking3d.results.run_notes import timed_pass
     from tracking3d.results.run_writer import times_written
 
     begun = False
@@ -83,7 +84,10 @@ def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], List
                 _write(folders)
         raise
     if folders and (begun or any(_is_due(folder, before[folder]) for folder in folders)):
-        _write(folders)
+        with ExitStack() as timed:
+            for folder in folders if begun else ():
+                timed.enter_context(timed_pass(folder, "report"))
+            _write(folders)
 
 
 def _is_due(folder: Path, before: tuple[int, ...]) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -51,6 +53,8 @@ def print_summary(folder: Path) -> None:
     table.add_row("seconds per frame", format_value(whole))
     for stage in STAGES if stages else ():
         table.add_row(f"  {stage}", format_value(getattr(stages, stage)))
+    if took := passes_in_words(run):
+        table.add_row("passes", took)
     if shape := run.get("shape"):
         table.add_row("shape", escape(str(shape)))
     if advice := advise_networks(reader.config.get("tracker", {}).get("name", "")):
@@ -61,6 +65,19 @@ def print_summary(folder: Path) -> None:
         if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
             table.add_row(what, "\n".join(files))
     print_table(table)
+
+
+def passes_in_words(run: Mapping[str, Any]) -> str:
+    """Seconds of each pass of a run, and how many frames it left as they were; empty for runs that do not say.
+
+    Args:
+        run: Its ``run.json``.
+    """
+    over = (run.get("refinement") or {}).get("passed_over") or {}
+    return ", ".join(
+        f"{name} {seconds:.1f} s" + (f" ({over[name]} frames passed over)" if over.get(name) else "")
+        for name, seconds in run["timings"].get("passes", {}).items()
+    )
 
 
 def advise_networks(tracker: str) -> str:

@@ -43,6 +43,11 @@ class Similarity:
         poses[:, :3, 3] = self.scale * T_cam_second[:, :3, 3] - poses[:, :3, :3] @ self.translation
         return poses
 
+    @property
+    def inverse(self) -> Similarity:
+        """From the first object's coordinates to the second's."""
+        return Similarity(self.R.T, 1 / self.scale, -self.translation @ self.R / self.scale)
+
     def after(self, other: Similarity) -> Similarity:
         """First ``other``, then this one."""
         moved = self.points(other.translation[None])[0]

@@ -79,9 +79,11 @@ class FinalRefinement:
 
     @property
     def frames_again(self) -> frozenset[int]:
-        """Indices of the frames whose estimates are made again; those of the others stand."""
-        kept = self._earlier.kept if self._earlier else ()
-        return frozenset(self._estimates.causal).difference(kept)
+        """Indices of the frames that the next pass changes, as far as is known; the others stand."""
+        stand = self._retracking.kept if self._last.masks is None else self._last.masks.kept
+        return frozenset(self._estimates.causal).difference(
+            self._earlier.kept if self._earlier else (), stand
+        )
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Estimate the object in a frame again, unless its estimate stands; None if it has no causal estimate."""
@@ -138,6 +140,7 @@ class FinalRefinement:
 
     def adjust_all(self) -> None:
         """All frames were taken again: adjust poses, surface and lens together."""
+        self._writer.begin_pass("landmarks")
         self._state.save()
         if self._earlier is None and self._retracking.kept:  # nothing was saved with the frames that are kept
             done = {"last_refined": max(self._estimates.causal), "refined_lines": self._estimates.lines}
@@ -151,6 +154,7 @@ class FinalRefinement:
             if self._session.config.object.segments_again:
                 self._last.begin_masks(self._session.config)
         self._writer.refine_camera(self._last.look.camera)
+        self._writer.begin_pass("poses")
 
     def _write_precomputed(self, precomputed: PrecomputedRefinement) -> None:
         """Take over poses and masks; frames are then only drawn."""
@@ -189,6 +193,7 @@ class FinalRefinement:
     def settle_masks(self) -> None:
         """Put together what the masks of all frames have in common, if masks are decided."""
         if self._last.masks is not None:
+            self._writer.begin_pass("masks")
             with measure("map") as watch:
                 self._last.settle_masks()
             self._estimates.together += watch.times

@@ -2,17 +2,19 @@
 
 The model is extended over them from the frames around (`gap_tracker`). If too many are left, the video is tracked once
 more from another frame (`second_start`), and whichever start explains more is refined. Images that follow each other in
-wide steps, or in no order, are joined as photos.
+wide steps, or in no order, are joined as photos. All of it together has a budget, see `TriedFrames`.
 """
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,29 @@ _log = logging.getLogger(__name__)
 _MIN_LOST = 0.05  # share of the frames from which something is done
 _MIN_TRACKED = 0.5  # share of a photo set below which its start is doubted
 _MIN_PHOTOS = 4  # photos with a mask
+T = TypeVar("T")
+
+
+@dataclass
+class TriedFrames:
+    """How many frames were tried once more by what: together at most as many as the video has.
+
+    Only a second start that explains clearly more than the first one, in the frames so far, goes on beyond that.
+    """
+
+    most: int  # frames of the video
+    by: Counter[str]  # frames that were tried, by what
+
+    @property
+    def left(self) -> int:
+        """Frames that may still be tried."""
+        return self.most - sum(self.by.values())
+
+    def count(self, what: str, frames: Iterable[T]) -> Iterator[T]:
+        """The same frames, counted as they are taken."""
+        for one in frames:
+            self.by[what] += 1
+            yield one
 
 
 def explain_lost_frames(session: Session, source: FrameSource, masks: SavedMasks) -> StartOfModel:
@@ -47,20 +72,28 @@ def explain_lost_frames(session: Session, source: FrameSource, masks: SavedMasks
     Returns:
         Where the model that is to be refined started.
     """
+    tried = TriedFrames(len(masks.estimates.causal), Counter({"while tracking": session.tried}))
+    start = _find_start_of_model(session, source, masks, tried)
+    return replace(start, tried=dict(+tried.by))
+
+
+def _find_start_of_model(
+    session: Session, source: FrameSource, masks: SavedMasks, tried: TriedFrames
+) -> StartOfModel:
     causal = masks.estimates.causal
     first = StartOfModel(session.first_index, "tracking began in this frame")
     advice = ""
     if needs_photo_start(session, source, masks):
-        started, advice = start_from_photos(session, source, masks)
+        started, advice = start_from_photos(session, source, masks, tried)
         if started is not None:
             return started
     first = replace(first, advice=advice if source.fps is None else "")
     lost = [index for index, one in causal.items() if one.status is Status.LOST and masks.has_mask(index)]
     if len(lost) < max(1, _MIN_LOST * len(causal)):
         return first
-    gaps = GapTracker(session, source, masks)
+    gaps = GapTracker(session, source, masks, tried)
     gaps.run({index: one.diagnostics.get(UNALIGNED_MAP, one.confidence) for index, one in causal.items()})
-    second = try_second_start(session, source, masks, gaps)
+    second = try_second_start(session, source, masks, gaps, tried)
     if second is None:
         return first
     compared = (
@@ -86,7 +119,7 @@ def needs_photo_start(session: Session, source: FrameSource, masks: SavedMasks) 
 
 
 def start_from_photos(
-    session: Session, source: FrameSource, masks: SavedMasks
+    session: Session, source: FrameSource, masks: SavedMasks, tried: TriedFrames
 ) -> tuple[StartOfModel | None, str]:
     """Join all frames as photos, and continue with that map if it explains more than what there is.
 
@@ -97,7 +130,8 @@ def start_from_photos(
 
     def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
         wanted = frozenset(indices)
-        return masks.with_masks(frame for frame in read_again(source) if frame.index in wanted)
+        frames = (frame for frame in read_again(source) if frame.index in wanted)
+        return masks.with_masks(tried.count("photos", frames))
 
     report_progress("joining photos")
     seen = tuple(sorted(index for index in causal if masks.has_mask(index)))
@@ -139,15 +173,18 @@ class SecondStart:
 
 
 def try_second_start(
-    session: Session, source: FrameSource, masks: SavedMasks, gaps: GapTracker
+    session: Session, source: FrameSource, masks: SavedMasks, gaps: GapTracker, tried: TriedFrames
 ) -> SecondStart | None:
     """Track from another frame, and continue with that start if it explains more; None if none is needed, or possible.
+
+    It ends early if it can no longer explain enough, or does not explain more of the frames so far when none are left.
 
     Args:
         session: The object after its last frame.
         source: The video.
         masks: The initial masks.
         gaps: What the first start explains.
+        tried: How many frames were tried already.
     """
     frames = len(masks.estimates.causal)
     if not session.order_of_time or len(gaps.unexplained) <= _MAX_UNEXPLAINED * frames:
@@ -159,16 +196,28 @@ def try_second_start(
     every = report_each("tracking from another frame", both_ways(again, start, source.name), source.count)
     with closing(every) as frames_both_ways:
         wanted = (frame for frame in frames_both_ways if isinstance(frame, Frame))
-        attempt = session.attempt(
-            masks.with_masks(frame for frame in wanted if frame.index in masks.estimates.causal)
-        )
+        known = (frame for frame in wanted if frame.index in masks.estimates.causal)
+        shown = masks.with_masks(tried.count("second start", known))
+        attempt = session.attempt(shown, lambda now: may_win(now, gaps.confidence, frames, tried.left))
     if attempt is None:
         return None
-    before = sum(known >= TRACKED_CONFIDENCE for known in gaps.confidence.values())
-    second = SecondStart(start, sum(one >= TRACKED_CONFIDENCE for one in attempt.confidence.values()), before)
+    second = SecondStart(start, _explained(attempt.confidence), _explained(gaps.confidence))
     if second.is_better:
         session.adopt(attempt)
     return second
+
+
+def may_win(now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int) -> bool:
+    """Whether a second start goes on, by the confidence in each frame now and with the first start, by index."""
+    explained = _explained(now)
+    if explained and explained + frames - len(now) <= _MIN_GAIN * _explained(before):
+        return False
+    shared = _explained({index: before.get(index, 0.0) for index in now})
+    return left > 0 or explained > _MIN_GAIN * shared
+
+
+def _explained(confidence: Mapping[int, float]) -> int:
+    return sum(one >= TRACKED_CONFIDENCE for one in confidence.values())
 
 
 def find_start(source: FrameSource, masks: SavedMasks) -> int | None:
@@ -203,13 +252,14 @@ class GapTracker:
         session: The object after its last frame.
         source: The video, which can be read again.
         masks: The initial masks.
+        tried: How many frames were tried already.
 
     Attributes:
         confidence: Of the best pose in each frame, of the one model that is refined.
     """
 
-    def __init__(self, session: Session, source: FrameSource, masks: SavedMasks) -> None:
-        self._session, self._source, self._masks = session, source, masks
+    def __init__(self, session: Session, source: FrameSource, masks: SavedMasks, tried: TriedFrames) -> None:
+        self._session, self._source, self._masks, self._tried = session, source, masks, tried
         causal = masks.estimates.causal
         self._frames_taken = frozenset(causal)
         self.confidence = {index: one.confidence for index, one in causal.items()}
@@ -248,8 +298,9 @@ class GapTracker:
         with closing(self._frames(backwards)) as frames:
             for frame in frames:
                 if length := gaps.pop(frame.index, 0):
-                    self._extend(Gap(frame, self._masks.with_masks(islice(frames, length)), backwards))
-                if not gaps:
+                    inside = self._tried.count("gaps", islice(frames, min(length, max(self._tried.left, 0))))
+                    self._extend(Gap(frame, self._masks.with_masks(inside), backwards))
+                if not gaps or self._tried.left <= 0:
                     return
 
     def _extend(self, gap: Gap) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import PICTURES, RunWriter, WrittenSoFar, missing_files
 from tracking3d.trackers.prompts.corrections import Correction
 from tracking3d.trackers.prompts.prompt import PromptSet
+from tracking3d.video.opening import without_repeats
 from tracking3d.video.source import FrameSource, source_notes
 
 __all__ = ["Listener", "RecordOptions", "record", "record_objects", "record_tracking"]
@@ -189,6 +190,9 @@ def record_tracking(
         Tracking3dError: The frames finished until then stay in the folders, as on Ctrl-C.
     """
     folder, prompts = validate_folder(folder), request.prompts
+    prompted = {index for one in request.corrections for index in one}
+    prompted |= set() if prompts.start_frame is None else {prompts.start_frame}
+    request = replace(request, source=without_repeats(request.source, prompted))
     folders = object_folders(folder, len(prompts)) if prompts.as_lists else [folder]
     check_output_folder(folder, options.overwrite)
     with (

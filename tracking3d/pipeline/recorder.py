@@ -221,6 +221,7 @@ class ObjectRecorder:
                 self.precomputed,
                 self._earlier,
             )
+            self._writer.begin_pass("retracking")
         elif self._redraw:
             self._writer.begin_drawing_again()
 
@@ -243,6 +244,7 @@ class ObjectRecorder:
             )
             return None
         report_progress("refining the map")
+        self._writer.begin_pass("lost frames")
         self._causal_model = self._session.result()
         estimates = self._writer.begin_refinement(self._causal_model)
         if self._continue_earlier(estimates):
@@ -250,6 +252,7 @@ class ObjectRecorder:
         masks = SavedMasks(estimates, self._initial)
         estimates.start = explain_lost_frames(self._session, source, masks)
         report_progress("refining the map")
+        self._writer.begin_pass("map")
         self._session.refine()
         self._state.save(
             self._session.state_dict(),
@@ -292,6 +295,7 @@ class ObjectRecorder:
         if self.refinement is not None:
             self.refinement.draw_rest()
             self._work.wait()
+            self._writer.begin_pass("model")
             surface, views = self.refinement.final_model()
             # With `fine` and `extends` the reconstruction may be refused, and this texture stays.
             config = self._session.config

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -109,15 +109,25 @@ class SessionRefinement:
         """Whether all frames were shown to the solver in order of time."""
         return self._presented.last is None
 
-    def attempt(self, frames: Iterable[tuple[Frame, MaskEstimate]]) -> Attempt | None:
+    @property
+    def tried(self) -> int:
+        """Frames that the solver has tried once more while they came, see `Mapped.tried`."""
+        return int(getattr(self._state, "tried", 0))
+
+    def attempt(
+        self,
+        frames: Iterable[tuple[Frame, MaskEstimate]],
+        goes_on: Callable[[Mapping[int, float]], bool] = lambda confidence: True,
+    ) -> Attempt | None:
         """Track the object once more from another frame, with given masks.
 
         Args:
             frames: Frames with their initial masks: from the start to the end of the video, then those before it
                 backwards.
+            goes_on: Whether the next frame is to be taken, by the confidence in each frame so far.
 
         Returns:
-            What it comes to; None if the solver cannot, or a plug-in fails.
+            What it comes to; None if the solver cannot, a plug-in fails, or it does not go on to the end.
         """
         solver, state, first, found = self._solver, None, None, dict[int, FrameEstimate]()
         if not isinstance(solver, RefiningSolver):
@@ -138,6 +148,8 @@ class SessionRefinement:
                         estimate = order.index(estimate)
                     latest = max(latest, frame.index)
                     found |= {one.index: _without_masks(one) for one in (*estimate.revised, estimate)}
+                    if not goes_on({index: one.confidence for index, one in found.items()}):
+                        return None
         except PluginFailure:
             return None
         self.refining += watch.times

@@ -30,6 +30,7 @@ from tracking3d.reconstruction.run_views import (
 )
 from tracking3d.reconstruction.seen_regions import close_unseen
 from tracking3d.results import layout
+from tracking3d.results.layout import METRE
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader, open_run_source
@@ -350,6 +351,51 @@ def _runs_extended_by(
             return
         run = RunReader(earlier)
         yield run, similarity, views
+
+
+def between_runs(run: RunReader, other: RunReader) -> Similarity:
+    """From the object coordinates of a run to those of another one that has its object.
+
+    One was tracked by ``--object`` of the other, with or without ``--extend``, or both have the object of a third.
+
+    Raises:
+        InputError: If they share no object.
+    """
+    known = dict(_objects_of(run))
+    for folder, similarity in _objects_of(other):
+        if folder in known:
+            return similarity.inverse.after(known[folder])
+    raise InputError(
+        f"The runs {run.folder} and {other.folder} share no object; track the video of one with --object and the run "
+        "of the other, with or without --extend."
+    )
+
+
+def _objects_of(run: RunReader) -> Iterator[tuple[Path, Similarity]]:
+    """A run and those that its object is from, each with the similarity from the run's coordinates to its own."""
+    similarity, visited = Similarity.identity(), set[Path]()
+    while (here := run.folder.resolve()) not in visited:
+        visited.add(here)
+        yield here, similarity
+        note, model = run.description.get(EXTENDS), run.config.get("object", {}).get("model")
+        try:
+            if note is not None:
+                earlier, to_run = _parse_note(run, note)
+                before = RunReader(earlier)
+            elif model is not None and Path(model).is_dir():
+                before = RunReader(Path(model))
+                # A run of an object in metres is in metres; else either may have been put into metres since.
+                own = (
+                    1.0
+                    if run.unit == METRE and unit_scale(run) == 1
+                    else unit_scale(run) / unit_scale(before)
+                )
+                to_run = Similarity(np.eye(3), own, np.zeros(3))
+            else:
+                return
+        except InputError:  # the earlier run is gone
+            return
+        run, similarity = before, to_run.inverse.after(similarity)
 
 
 def _parse_note(run: RunReader, note: Any) -> tuple[Path, Similarity]:

@@ -11,7 +11,7 @@ from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_notes import note_in_run
+from tracking3d.results.run_notes import note_in_run, timed_pass
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.source import FrameSource
 
@@ -37,9 +37,10 @@ def is_reconstructed(
         return False
     if source is not None and not source.repeatable:
         return False
-    rotations = [
-        record.T_cam_obj[:3, :3] for record in records if record.refined and record.status is Status.TRACKED
-    ]
+    final = [record for record in records if record.refined and record.status is Status.TRACKED]
+    if any(record.free_axis for record in final):  # a surface of revolution is smooth, that of all frames not
+        return False
+    rotations = [record.T_cam_obj[:3, :3] for record in final]
     return has_packages() and len(rotations) >= FEWEST and largest_turn(np.stack(rotations)) >= LEAST_TURN
 
 
@@ -62,7 +63,8 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
         OutputError: If something cannot be written.
     """
     if config.object.extends is not None:
-        sentence = _extend(folder, config, source)
+        with timed_pass(folder, "shape"):
+            sentence = _extend(folder, config, source)
         note_in_run(folder, {"shape": sentence})
         return sentence
     from tracking3d.reconstruction.rebuild import rebuild_shape  # slow to import, and only needed at the end
@@ -70,15 +72,15 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
     records = RunReader(folder).frames if config.object.shape == "auto" and not always else ()
     if not (always or is_reconstructed(records, config, source)):
         return ""
-    if source.repeatable:
+    with timed_pass(folder, "shape"):
         try:
-            sentence = rebuild_shape(folder, source, *texture_limits(config)).sentence
+            sentence = (
+                f"The shape stays, for {source.name} comes once only and all frames are needed a second time."
+            )
+            if source.repeatable:
+                sentence = rebuild_shape(folder, source, *texture_limits(config)).sentence
         except InputError as error:
             sentence = str(error)
-    else:
-        sentence = (
-            f"The shape stays, for {source.name} comes once only and all frames are needed a second time."
-        )
     note_in_run(folder, {"shape": sentence})
     return sentence
 

@@ -43,6 +43,9 @@ _USUAL_VIEWS = 48
 box_in_hand were no better, and the time of a round grows with their square."""
 _FRAMES_A_VIEW = 5  # frames of a long video for each view that is bundled
 _LEAST_VIEWS = 4
+# Deviations by which the default lens is off where it is not taken, and degrees that views are then apart (chosen: the
+# photos of the car have 12 and 160; deviations of views from one side are too small).
+_EXCLUDED, _SIDES_APART = 4.0, 60.0
 _Pose = NDArray[np.float64]
 
 
@@ -107,17 +110,20 @@ class GlobalAdjustment:
         self.vertices = self._scene.vertices
         self._turn = self._common_turn()
         deviation = scene.focal_deviation
-        if deviation is not None and deviation > LENS_KNOWN:
-            self.camera = self.camera.zoom(scene.focal_factor, DEFAULT_ORIGIN)
-        elif scene.focal_factor != 1:
-            self.camera = self.camera.with_solved_focal(scene.focal_factor)
+        factor = scene.focal_factor
+        is_default = math.isclose(factor, self.camera.default_factor)
+        if deviation is not None and deviation > LENS_KNOWN and is_default:
+            self.camera = self.camera.zoom(factor, DEFAULT_ORIGIN)
+        elif factor != 1:
+            self.camera = self.camera.with_solved_focal(factor)
         if deviation is not None:
             self.camera = replace(self.camera, focal_deviation=deviation)
 
     def _refine(self, most: int) -> LandmarkScene:
         """The scene of at most so many views, spread evenly, as their landmarks have it.
 
-        Through a lens that they do not tell, whatever the first map took for the likeliest one, the default is used.
+        Through a lens that they do not tell, whatever the first map took for the likeliest one, the default is used,
+        unless views from sides apart speak against that one.
         """
         there = sorted(self._views)
         at = np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).round().astype(int))
@@ -129,6 +135,10 @@ class GlobalAdjustment:
         refined = refine_through(scene, rounds, self.camera)
         deviation, factor = refined.focal_deviation, self.camera.default_factor
         if deviation is None or deviation <= LENS_KNOWN or math.isclose(factor, 1):
+            return refined
+        R = np.stack([T[:3, :3] for T in self._before.values()])
+        turn = np.degrees(np.arccos(np.clip((np.einsum("aij,bij->ab", R, R).min() - 1) / 2, -1, 1)))
+        if turn > _SIDES_APART and abs(math.log(factor / refined.focal_factor)) > _EXCLUDED * deviation:
             return refined
         poses = [_through_lens(self._views[index].T_cam_obj, factor) for index in self._bundled]
         refined = refine_scene(scene.redrawn(self.vertices, dict(enumerate(poses)), factor), rounds)

@@ -11,18 +11,16 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, HeldOutScores, held_out_scores, is_held_out
 from tracking3d.reconstruction.run_views import (
     RunViews,
     collect_views,
     no_reliable_frame_error,
     reliable_frames,
-    views_of_frame,
 )
 from tracking3d.reconstruction.seen_regions import close_unseen
-from tracking3d.reconstruction.shape import MOST, reconstruct_shape
+from tracking3d.reconstruction.shape import reconstruct_shape
 from tracking3d.reconstruction.texturing import bake_texture, replace_shape
-from tracking3d.reconstruction.views import keep_best_views, spread_by_rotation, texture_view
+from tracking3d.reconstruction.views import keep_best_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
@@ -35,7 +33,6 @@ from tracking3d.video.source import FrameSource
 
 EXTENDS = "extends"
 """Key in ``run.json`` of the run whose frames made the mesh, too."""
-_TEXTURE_VIEWS = 24
 _NEEDED = ("skimage", "fast_simplification")
 
 
@@ -165,48 +162,6 @@ def restore_online_mesh(folder: Path) -> bool:
         return False
     _replace_mesh(run, model)
     return True
-
-
-def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
-    """How well the mesh of a run predicts frames that it was not made from.
-
-    The frames that `rebuild_shape` keeps out are; the others give the mesh its texture again, and the poses alone of
-    those kept out are fitted to it. Nothing is written. All frames have shaped the surface of an online map's mesh.
-
-    Args:
-        folder: The run folder.
-        source: The video; None for the one that the run names.
-        largest: Most texels along a side.
-
-    Raises:
-        InputError: If a package is missing, the run goes on, has no mesh, too few reliable frames, or the
-            video is another one.
-    """
-    check_packages()
-    run = RunReader(folder)
-    model = load_model(run.mesh_folder)
-    used: list[ObjectView] = []
-    left_out: list[tuple[ObjectView, ObjectView]] = []
-    views: tuple[ObjectView, ...] = ()
-    count = 0
-    for frame, record in reliable_frames(run, source):
-        if (seen := views_of_frame(run, frame, record)) is None:
-            continue
-        if is_held_out(count):
-            left_out.append(seen)
-        else:
-            used.append(seen[0])
-            views = keep_best_views(views, seen[1], _TEXTURE_VIEWS)
-        count += 1
-        if len(used) > 2 * MOST:
-            used = spread_by_rotation(used, 0.5, MOST)
-        if len(left_out) > MOST_LEFT_OUT:
-            left_out = left_out[::2]
-    if not left_out:
-        raise InputError(
-            f"Only {count} frames of the run {folder} are reliable; none can be held out to test its model."
-        )
-    return held_out_scores(bake_texture(model, views, largest), used, left_out)
 
 
 def has_packages() -> bool:

@@ -216,7 +216,7 @@ def _seen(model: ObjectModel, texels: TexelMap, view: ObjectView) -> Seen:
     return seen.texel.numpy(), seen.values.numpy(), seen.weight.numpy()
 
 
-_SIZE = 256
+_BLANK = 64  # texels along a side of a texture that a better one replaces
 
 
 def replace_shape(
@@ -233,18 +233,18 @@ def replace_shape(
         views: The frames that say what of it was seen.
 
     Returns:
-        It, with a coarse texture until it gets a better one.
+        It, in its mean colour until it gets a texture.
     """
     face_uvs = unwrap(vertices, faces)
-    features, colours = len(model.features), len(model.texture)
+    mean = model.texture.reshape(-1, 3).mean(0)
     return replace(
         model,
         vertices=vertices,
         faces=faces,
         face_uvs=face_uvs,
-        features=_transfer_texture(model, model.features, vertices, faces, face_uvs, features),
-        texture=_transfer_texture(model, model.texture, vertices, faces, face_uvs, min(colours, _SIZE)),
-        texture_weight=np.zeros((min(colours, _SIZE),) * 2, np.float32),
+        features=_transfer_texture(model, model.features, vertices, faces, face_uvs),
+        texture=np.broadcast_to(mean, (_BLANK, _BLANK, 3)).astype(model.texture.dtype),
+        texture_weight=np.zeros((_BLANK, _BLANK), np.float32),
         seen=seen_vertices(vertices, faces, views),
     )
 
@@ -255,12 +255,10 @@ def _transfer_texture(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
     face_uvs: NDArray[np.float64],
-    size: int,
 ) -> NDArray:
-    """A texture ``(size, size, C)`` of the new surface from ``(T, T, C)`` of the old: from the nearest texel."""
-    if len(values) > size:
-        values = cv2.resize(values, (size, size), interpolation=cv2.INTER_AREA)
-    old_texel, old_points = _texel_points(model.vertices, model.faces, model.face_uvs, len(values))
+    """A texture ``(T, T, C)`` of the new surface from one of the old: from the nearest texel."""
+    size = len(values)
+    old_texel, old_points = _texel_points(model.vertices, model.faces, model.face_uvs, size)
     texel, points = _texel_points(vertices, faces, face_uvs, size)
     _, nearest = cKDTree(old_points).query(points, eps=0.2)
     flat = values.reshape(-1, values.shape[2])

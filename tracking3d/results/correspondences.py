@@ -266,9 +266,13 @@ def tracked_record(run: RunReader, frame: int) -> FrameRecord:
     return record
 
 
-def points_to_json(tracks: PointTracks) -> str:
-    """One JSON object with the fields of `PointTracks` as nested lists; NaN is null."""
-    return json.dumps(jsonable(vars(tracks)), allow_nan=False)
+def points_to_json(tracks: PointTracks, there: PointTracks | None = None) -> str:
+    """One JSON object with the fields of `PointTracks` as nested lists; NaN is null.
+
+    If there are tracks in another run, ``other`` has their fields.
+    """
+    other = {} if there is None else {"other": vars(there)}
+    return json.dumps(jsonable({**vars(tracks), **other}), allow_nan=False)
 
 
 COLUMNS = [
@@ -287,12 +291,18 @@ COLUMNS = [
 ]
 
 
-def points_to_csv(tracks: PointTracks) -> str:
+def points_to_csv(tracks: PointTracks, there: PointTracks | None = None) -> str:
     """One row a frame and point, with the columns `COLUMNS`.
 
     x, y and uncertainty are pixels, X, Y and Z object coordinates; empty if they are unknown. ``kind`` says by
-    what a point is followed, see `PointKind`.
+    what a point is followed, see `PointKind`. If there are tracks in another run, a column ``run`` in front is 0, and
+    1 in the rows of that one, which follow.
     """
+    if there is not None:
+        head, *rows = points_to_csv(tracks).splitlines()
+        both = [f"run,{head}", *(f"0,{row}" for row in rows)]
+        both += [f"1,{row}" for row in points_to_csv(there).splitlines()[1:]]
+        return "\n".join(both) + "\n"
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)

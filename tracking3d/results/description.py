@@ -8,7 +8,7 @@ import re
 import socket
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -88,6 +88,8 @@ class StartOfModel:
     frame: int  # index of the frame
     reason: str  # why it started there, in words
     advice: str = ""  # of photos: which could not be joined, and what to do; empty if all were
+    # how many frames were tried once more because the object was lost, by what
+    tried: Mapping[str, int] = field(default_factory=dict)
 
 
 def refinement(
@@ -119,7 +121,7 @@ def refinement(
         "reason": reason,
         "start": None
         if start is None
-        else {key: value for key, value in asdict(start).items() if value != ""},
+        else {key: value for key, value in asdict(start).items() if value not in ("", {})},
         "frames": len(refined),
         "kept_causal": len(causal) - len(refined),
         "kept_refined": kept if refined else 0,
@@ -133,7 +135,7 @@ def refinement(
 def summary(
     records: Sequence[FrameRecord],
     skipped: int,
-    seconds: float,
+    passes: Mapping[str, float],
     causal: Sequence[FrameRecord] | None = None,
 ) -> dict[str, Any]:
     """Counts, plug-in failures, timings, mean IoU, where masks come from and highest memory of a run.
@@ -141,7 +143,7 @@ def summary(
     Args:
         records: The estimate for every frame.
         skipped: Number of frames that could not be decoded.
-        seconds: Wall time of the whole run.
+        passes: Wall time of the run by pass.
         causal: The causal estimates, whose seconds are the run's; ``records`` themselves if None.
     """
     causal = records if causal is None else causal
@@ -163,7 +165,8 @@ def summary(
             {"reason": reason, "frames": frames} for reason, frames in failures.most_common(MOST_FAILURES)
         ],
         "timings": {
-            "seconds_total": seconds,
+            "seconds_total": sum(passes.values()),
+            "passes": dict(passes),
             "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,
             "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
             "stages": _plain(stages_of(causal)),

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -324,6 +325,18 @@ def keep_given_masks(
             (folder / layout.PROMPTS).mkdir(exist_ok=True)
     for index, mask in given.items():
         write_mask(layout.prompt_path(folder, index), mask)
+
+
+def repeat_masks(folder: Path, index: int | None, again: int) -> None:
+    """Give frame ``again`` of a run the masks of frame ``index``, whose picture it repeats.
+
+    Raises:
+        OutputError: If one cannot be written.
+    """
+    of_frame = (layout.mask_path, layout.initial_mask_path, layout.probability_path)
+    for inner, path_of in product((folder, folder / layout.CAUSAL), of_frame):
+        if index is not None and (mask := path_of(inner, index)).is_file():
+            write_atomic(path_of(inner, again), mask.read_bytes())
 
 
 def read_given_mask(folder: Path, index: int) -> NDArray[np.bool_]:

@@ -64,7 +64,7 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
     deviation = camera.get("focal_deviation")
     if is_lens_uncertain(camera):
         uncertain = "" if deviation is None else f", uncertain by {100 * deviation:.0f} % of the focal length"
-        if deviation is not None and deviation > LENS_KNOWN:
+        if deviation is not None and deviation > LENS_KNOWN and "solved" not in camera["origin"]:
             uncertain = ", and the video does not tell it"
         notes.append(
             f"no focal length was given: {camera['origin']}{uncertain}; give --fov or --intrinsics if depth matters"

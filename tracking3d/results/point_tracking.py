@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -18,13 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame, Image
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.points.follow import FEATURES, Followed, follow_points
 from tracking3d.points.image_following import ImageTracks, follow_in_images
 from tracking3d.points.landmark_adjustment import ROUNDS, LandmarkScene, fit_outlines, refine_scene
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.surface_association import meetings, merge_image_points
-from tracking3d.points.view import open_view
+from tracking3d.points.view import open_view, redraw_surface
 from tracking3d.results import layout
 from tracking3d.results.correspondences import (
     PointKind,
@@ -108,6 +109,68 @@ class RunScene:
             return tracks
         points = follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
         return with_image_points(tracks, rest, points, on_it[rest])
+
+    def track_in(self, other: RunScene, similarity: Similarity, frame: int, xy: ArrayLike) -> PointTracks:
+        """Follow pixels of one frame through another run of the same object, with the surface of that one.
+
+        The frame is taken for one more view of the other run, beside the one in which the object is turned most alike.
+
+        Args:
+            other: The other run.
+            similarity: From this run's object coordinates to those of the other.
+            frame: Index of this run's frame that ``xy`` is in.
+            xy: ``(N, 2)`` pixels, see `track`.
+
+        Returns:
+            Tracks in the frames of the other run; ``face``, ``points`` and the like are of its mesh.
+
+        Raises:
+            InputError: If the run has no such frame, the object was lost in it or in all of the others, or ``xy`` are
+                no points.
+        """
+        query, asked = as_points(xy), tracked_record(self.run, frame)
+        view = self.scene.views[next(row for row, one in enumerate(self.run.frames) if one is asked)]
+        views = list(other.scene.views)
+        there = [row for row, one in enumerate(views) if one is not None]
+        if view is None or not there:
+            raise InputError(
+                f"The object is not seen in frame {frame} of {self.run.folder}, or in {other.run.folder}."
+            )
+        T = similarity.poses(view.T_cam_obj[None])[0]
+        turned = [np.trace(T[:3, :3].T @ one.T_cam_obj[:3, :3]) for one in views if one is not None]
+        place = there[int(np.argmax(turned))] + 1
+        view = redraw_surface(view, other.scene.vertices, other.scene.faces, T)
+        views.insert(place, view)
+        seen = self.run.camera_of(asked).to_pinhole(query)
+        seen[~in_frame(self.run.camera, query)] = np.nan
+        found = follow_points(replace(other.scene, views=views, support={}), place, seen)
+        on_object = np.asarray(np.isfinite(found.points).all(1))
+        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
+        if on_object.any():
+            face[on_object], barycentric[on_object] = surface_under(
+                *view.project(other.scene.vertices), other.scene.faces, view.to_window(seen[on_object])
+            )
+        records = other.run.frames
+        rest = [row for row in range(len(views)) if row != place]
+        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
+        positions = [
+            other.run.camera_of(one).to_picture(at)
+            for one, at in zip(records, found.positions[rest], strict=True)
+        ]
+        return PointTracks(
+            frame,
+            query,
+            np.array([one.index for one in records], dtype=np.int64),
+            np.stack(positions),
+            found.visible[rest] & ~lost[:, None],
+            on_object,
+            face,
+            barycentric,
+            found.points,
+            found.uncertainty[rest],
+            found.measured[rest],
+            kinds(on_object),
+        )
 
 
 def open_scene(

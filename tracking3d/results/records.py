@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.frames import SkippedFrame
 from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.stage_times import StageTimes
@@ -121,6 +122,14 @@ class FrameRecord:
         """The record, with the time that writing masks and pictures took."""
         stages = None if self.stages is None else self.stages + StageTimes(write=seconds)
         return replace(self, stages=stages, seconds=self.seconds + seconds)
+
+    def repeated(self, by: SkippedFrame) -> Self:
+        """The record of a frame that shows the same picture again."""
+        stages = None if self.stages is None else StageTimes()
+        return replace(
+            self, index=by.index, time=by.time, name=by.name, keyframe=False, iterations=0, seconds=0.0, stages=stages,
+            hypothesis=f"that of frame {self.index}",
+        )  # fmt: skip
 
     @property
     def has_pose(self) -> bool:

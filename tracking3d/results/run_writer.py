@@ -27,6 +27,7 @@ from tracking3d.results.files import (
     expect_visible_masks,
     first_problem,
     read_mask,
+    repeat_masks,
     try_lock,
     write_image,
     write_mask,
@@ -81,13 +82,16 @@ class RunWriter:
     ) -> None:
         self.folder = Path(folder)
         self._camera, self._fps = header.camera, header.fps or DEFAULT_FPS
-        self._started, self._drawing, self._over = time.monotonic(), 0.0, False
+        self._passes: dict[str, float] = {}
+        self._pass, self._pass_began = "tracking", time.monotonic()
+        self._drawing, self._over = 0.0, False
         self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
         self._sheet = RegularWork(partial(self._write_contact_sheet, None), SHEET_EVERY, SHEET_SHARE)
         self._refinement: RefinementWriter | None = None
         self._probabilities = bool(header.config.get("runtime", {}).get("probabilities"))
         self._description = description.description_at_start(header)
         self._kept: dict[int, FrameRecord] = {}
+        self._repeats: list[SkippedFrame] = []
         if resume is None:
             check_output_folder(self.folder, overwrite)
         with writing(self.folder):
@@ -113,7 +117,16 @@ class RunWriter:
     @property
     def seconds(self) -> float:
         """Wall time of the run so far, pauses left out."""
-        return time.monotonic() - self._started
+        return sum(self.passes.values())
+
+    @property
+    def passes(self) -> dict[str, float]:
+        """The same by pass; `tracking` is the first."""
+        return self._passes | {self._pass: time.monotonic() - self._pass_began}
+
+    def begin_pass(self, name: str) -> None:
+        """From here on time belongs to the pass ``name``."""
+        self._passes, self._pass, self._pass_began = self.passes, name, time.monotonic()
 
     @property
     def lines(self) -> int:
@@ -166,7 +179,13 @@ class RunWriter:
         return record
 
     def skip(self, skipped: SkippedFrame) -> None:
-        """Record a frame that could not be decoded or was dropped; an `OutputError` says that it cannot be."""
+        """Record a frame that could not be decoded or was dropped; an `OutputError` says that it cannot be.
+
+        One that repeats the picture before gets the estimates of that one at the end.
+        """
+        if skipped.repeats is not None:
+            self._repeats.append(skipped)
+            return
         self._description["skipped"].append({"index": skipped.index, "reason": skipped.reason})
         # A camera drops many frames a second, and the file is written whole.
         if time.monotonic() - self._described >= SKIPS_EVERY:
@@ -291,11 +310,13 @@ class RunWriter:
         self._lines.go_on(so_far.lines)
         known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._kept = {record.index: record for record in known}
-        self._started -= so_far.seconds
+        self._passes["earlier"] = so_far.seconds
         self._description |= {key: earlier[key] for key in _STAYS & earlier.keys()}
         again = {"at": description.now(), "frames": len(known)}
         self._description["resumed"] = [*earlier.get("resumed", ()), again]
-        self._description["skipped"] = [{"index": one.index, "reason": one.reason} for one in so_far.skipped]
+        self._repeats = [one for one in so_far.skipped if one.repeats is not None]
+        left_out = [one for one in so_far.skipped if one.repeats is None]
+        self._description["skipped"] = [{"index": one.index, "reason": one.reason} for one in left_out]
 
     def record(
         self, estimate: FrameEstimate, name: str, revision: bool, started: float | None = None
@@ -335,6 +356,7 @@ class RunWriter:
         steps: list[Callable[[], None]] = [
             self._pictures.close,
             partial(self._give_up_refinement, state, error),
+            self._write_repeats,
             partial(self._finish, model),
             partial(write_visible_masks, self.folder),
         ]
@@ -344,6 +366,27 @@ class RunWriter:
             mesh, pictures = model is not None, self._pictures.any
             steps.append(partial(check_complete, self.folder, mesh=mesh, pictures=pictures))
         return first_problem(*steps)
+
+    def _write_repeats(self) -> None:
+        """Give frames that repeat the picture before the estimates of that one, causal and refined, and its masks."""
+        if not self._repeats:
+            return
+        with writing(self.folder / layout.FRAMES):
+            self._lines.truncate()
+        records = list(read_records(self.folder / layout.FRAMES))
+        causal = {one.index: one for one in latest(records, refined=False)}
+        refined = {one.index: one for one in latest(records) if one.refined}
+        again = [one for one in self._repeats if one.repeats in causal]
+        for one in again:
+            repeat_masks(self.folder, one.repeats, one.index)
+        self._lines.append(
+            [
+                known[one.repeats].repeated(one)
+                for known in (causal, refined)
+                for one in again
+                if one.repeats in known
+            ]
+        )
 
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
@@ -363,7 +406,7 @@ class RunWriter:
     def _summarize(self, records: list[FrameRecord]) -> dict[str, Any]:
         """Counts and times of the run so far."""
         skipped = len(self._description["skipped"])
-        return description.summary(latest(records), skipped, self.seconds, latest(records, refined=False))
+        return description.summary(latest(records), skipped, self.passes, latest(records, refined=False))
 
 
 PICTURES = (layout.OVERLAY, layout.CONTACT_SHEET)

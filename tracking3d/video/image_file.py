@@ -29,6 +29,7 @@ SUFFIXES = frozenset((
 # Named, because Pillow also takes text, vector and video formats for images, and runs programs for some.
 _FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TIFF", "GIF", "WEBP", "JPEG2000", "AVIF")
 
+_MAKER, _MODEL = 0x010F, 0x0110
 _ORIENTATION, _EXIF, _FOCAL_LENGTH_35MM, _FOCAL_LENGTH = 0x0112, 0x8769, 0xA405, 0x920A
 _WIDTH, _HEIGHT, _PIXELS_A_UNIT, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA210  # of the sensor, along x
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of that unit (Exif 2.32)
@@ -61,7 +62,8 @@ def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
 
     The 35 mm equivalent focal length is the one with the same *diagonal* field of view on a 36 x 24 mm frame
     (CIPA DCG-001), so ``f = f35 * diagonal in pixels / 43.27``. Without it, the focal length in mm counts with the
-    sensor's resolution, for the size that the file has now. The principal point is the centre.
+    sensor's resolution, for the size that the file has now, or with its size, if lensfunpy (extra ``lens``) knows the
+    camera. The principal point is the centre.
 
     Returns:
         ``((fx, fy, cx, cy), origin)`` in pixels of the upright image, or None if the file does not tell.
@@ -80,12 +82,26 @@ def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
                 # Files are made smaller, and turned, by programs that leave the sensor's figures as they were.
                 taken = max(told.get(_WIDTH, 0), told.get(_HEIGHT, 0))
                 f *= max(width, height) / taken if taken else 1.0
+            elif not focal_length and _FOCAL_LENGTH in told and (crop := _crop_factor(image)):
+                focal_length, how = float(told[_FOCAL_LENGTH]), "by the sensor's size in lensfun"
+                f = focal_length * crop * math.hypot(width, height) / _DIAGONAL_35MM
     except Exception:  # None is fine here; read_image reports damaged files
         return None
     if not (0 < focal_length < math.inf and 0 < f < math.inf):
         return None
     origin = f"EXIF of {path.name}: focal length {focal_length:g} mm {how}"
     return (f, f, (width - 1) / 2, (height - 1) / 2), origin
+
+
+def _crop_factor(image: Pillow.Image) -> float:
+    """Diagonal of 35 mm film over that of the camera's sensor, by lensfun's data base; 0 if that does not know it."""
+    try:
+        import lensfunpy
+    except ImportError:
+        return 0.0
+    maker, model = (str(image.getexif().get(tag, "")).strip(" \0") for tag in (_MAKER, _MODEL))
+    found = lensfunpy.Database().find_cameras(maker, model) if maker and model else ()
+    return float(found[0].crop_factor) if found else 0.0
 
 
 def mode_of(path: Path) -> str:

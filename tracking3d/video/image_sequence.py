@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.image_file import SUFFIXES, mode_of, read_exif_intrinsics, read_image
 from tracking3d.video.source import EVERY_FRAME, Intrinsics, check_frames, natural_order, within
 
@@ -73,6 +74,7 @@ class ImageSequence:
     rate: float | None = None
     repeatable: bool = True
     notes: tuple[str, ...] = ()
+    distinct: frozenset[int] | None = None  # see `tracking3d.video.source.check_frames`
 
     @classmethod
     def open(
@@ -115,13 +117,23 @@ class ImageSequence:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Read the selected images; those that cannot be read are given as skipped."""
-        return check_frames(self._frames(), self.name)
+        return check_frames(self._frames(), self.name, self.distinct)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
+        last: tuple[Path, Image] | None = None  # kept so that equal files are decoded once
         for index in self.selection:
             file = self.files[index]
             try:
                 seconds = None if self.rate is None else index / self.rate
-                yield Frame(index, read_image(file), seconds, file.name)
+                image = last[1] if last and _are_equal(last[0], file) else read_image(file)
+                last = None if self.distinct is None else (file, image)
+                yield Frame(index, image, seconds, file.name)
             except InputError as error:
                 yield SkippedFrame(index, str(error).removesuffix("."))
+
+
+def _are_equal(one: Path, other: Path) -> bool:
+    try:
+        return filecmp.cmp(one, other, shallow=False)
+    except OSError:  # `read_image` says why it cannot be read
+        return False

@@ -64,6 +64,18 @@ def open_source(
     )
 
 
+def without_repeats(source: FrameSource, used: Iterable[int]) -> FrameSource:
+    """The same file or images, of which pictures that repeat the one before to the bit are given as skipped.
+
+    Args:
+        source: Any source; a live one, and arrays, stay as they are.
+        used: Indices of frames that are given all the same, since a prompt is for them.
+    """
+    if isinstance(source, ImageSequence | VideoFile):
+        return replace(source, distinct=frozenset(used))
+    return source
+
+
 def _open_path(name: str, selection: range) -> FrameSource:
     check_source_name(name)
     path = Path(name).expanduser()

@@ -8,6 +8,8 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, SkippedFrame, pixels
 
@@ -82,24 +84,34 @@ def known_indices(source: FrameSource) -> Collection[int] | None:
     return selection if source.count is None else selection[: source.count]
 
 
-def check_frames(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:
+def check_frames(
+    frames: Iterable[Frame | SkippedFrame], name: str, distinct: Collection[int] | None = None
+) -> Iterator[Frame | SkippedFrame]:
     """Pass ``frames`` on; skip those of another size than the first, and insist on at least one.
 
     Args:
         frames: The frames of one source, with those it could not decode.
         name: The source's name, for messages.
+        distinct: If given, pictures that repeat the one before to the bit are skipped, but for these indices.
 
     Raises:
         InputError: After the last frame, if there was none to use.
     """
     first: tuple[str, tuple[int, int]] | None = None
     reason: str | None = None
+    last: Frame | None = None
     for frame in frames:
         if isinstance(frame, SkippedFrame):
             reason = reason or frame.reason
             yield frame
         elif first is None or frame.size == first[1]:
             first = first or (frame.name, frame.size)
+            seen = last if distinct is not None and frame.index not in distinct else None
+            if seen and (frame.image is seen.image or np.array_equal(frame.image, seen.image)):
+                why = f"the picture of {seen.label} again"
+                yield SkippedFrame(frame.index, why, seen.index, frame.time, frame.name)
+                continue
+            last = None if distinct is None else frame
             yield frame
         else:
             yield SkippedFrame(

@@ -40,6 +40,7 @@ class VideoFile:
     notes: tuple[str, ...] = ()  # what was done to the pictures, in clauses
     # whether the header states how many frames there are; else count comes from duration and rate
     counted: bool = False
+    distinct: frozenset[int] | None = None  # see `tracking3d.video.source.check_frames`
 
     @property
     def indices(self) -> range | None:
@@ -73,7 +74,7 @@ class VideoFile:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Decode the selected frames; those that cannot be decoded are given as skipped."""
-        return check_frames(self._frames(), self.name)
+        return check_frames(self._frames(), self.name, self.distinct)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         with self.container() as container:

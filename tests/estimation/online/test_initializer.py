@@ -341,13 +341,14 @@ def test_a_map_that_explains_frames_badly_for_long_is_begun_again_twice_at_most(
     last, points = (turned(0), 0), FollowedPoints.none()
     state = Mapped(
         CAMERA, object_map, last, np.zeros((SIZE, SIZE), np.uint8), points,
-        surface=object_map.surface(), misfits=4, lost_frames=2,
+        surface=object_map.surface(), misfits=4, lost_frames=2, doubtful_frames=15,
     )  # fmt: skip
     assert initializer.restart_if_misfit(state, CONFIG) is state
     state = initializer.restart_if_misfit(replace(state, misfits=5), CONFIG)
     assert state.object_map is better
     assert state.last_pose == (better.keyframes[-1].pose, better.keyframes[-1].index)
     assert (state.misfits, state.lost_frames, state.restarts) == (0, 0, 1)
+    assert state.doubtful_frames == 15, "a map with points is not waited for from the start again"
     state = initializer.restart_if_misfit(replace(state, misfits=5, object_map=object_map), CONFIG)
     assert state.object_map is better
     last = replace(state, misfits=9, object_map=object_map)

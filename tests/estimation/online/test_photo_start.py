@@ -33,6 +33,7 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     neighbouring_pairs,
 )
 from tracking3d.points.bundle_adjustment.adjustment import Tracks
+from tracking3d.testing.synthesis import convex_clips
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
@@ -84,6 +85,28 @@ def test_photos_in_any_order_are_joined_by_all_their_pairs():
     assert start.structure is not None
     assert len(start.structure.photos) == 8
     assert errors(start.structure, turntable(), order).max() < 3
+
+
+def test_a_thing_that_is_turned_over_between_photos_is_one_solid(monkeypatch):
+    """Six photos of one side, and six of the other: what both show joins them."""
+    poses = convex_clips._poses
+
+    def of_two_sides(spec, camera, radius):
+        T = poses(spec, camera, radius)
+        over = Rotation.from_rotvec(np.pi * np.array([0.0, 0.25, 1.0]) / np.hypot(0.25, 1.0)).as_matrix()
+        for index in range(6, 12):  # upside down, and the same turns again
+            T[index, :3, :3] = T[index - 6, :3, :3] @ T[0, :3, :3].T @ over @ T[0, :3, :3]
+        return T
+
+    monkeypatch.setattr(convex_clips, "_poses", of_two_sides)
+    clip = turntable.__wrapped__(12, 25.0)
+    seen = zip(clip.images, clip.masks, strict=True)
+    start = start_of_photos(
+        [Photo.of(n, grey(image), mask) for n, (image, mask) in enumerate(seen)], clip.camera
+    )
+    assert start.structure is not None
+    assert len(start.structure.photos) == 12 and start.reason == ""
+    assert errors(start.structure, clip).max() < 3
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from tracking3d.estimation.online.initialization.initial_map import (
     DIRECTIONS,
     PROFILES,
     TURN,
+    continue_rotation,
     initialize_without_points,
     restart_without_points,
     reverse_rotations,
@@ -96,6 +97,23 @@ def test_a_reversed_rotation_has_the_same_outlines_of_a_distant_object() -> None
         there = points @ view.pose.R.T
         reflected = points @ flip @ other.R.T
         assert torch.allclose(there[:, :2], reflected[:, :2], atol=1e-4)
+
+
+@pytest.mark.parametrize("angles", [[0, 6, 12, 18, 24, 30, 36], [0, 6, 12, 18, 12, 6, 0]])
+def test_a_rotation_that_tracking_lost_goes_on_as_in_the_first_views_or_comes_back(
+    angles: list[float],
+) -> None:
+    views = list(turned_map([float(angle) for angle in angles], step=6).keyframes)
+    true = [view.pose for view in views]
+    # Tracking follows the first twelve frames, and no further.
+    lagging = [
+        replace(view, pose=replace(view.pose, quaternion=true[min(n, 2)].quaternion))
+        for n, view in enumerate(views)
+    ]
+    found = continue_rotation(lagging, CAMERA)
+    off = [max(degrees_apart(a, b) for a, b in zip(poses, true, strict=True)) for poses in found]
+    assert max(degrees_apart(a.pose, b) for a, b in zip(lagging, true, strict=True)) >= 11.9
+    assert min(off) < 1
 
 
 def test_a_rotation_between_the_directions_that_are_tried_is_found() -> None:

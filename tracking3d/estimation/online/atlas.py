@@ -104,6 +104,7 @@ def switch_map(state: Mapped, begun: Mapped, similarity: Similarity) -> Mapped:
         ),
         active_since=first,
         unaligned=True,
+        tried=state.tried,
     )
 
 

@@ -194,6 +194,7 @@ class Initializer:
             if updated.object_map is state.object_map or not state.revisable:
                 return updated, ()
             updated, revised = self._estimate_pending(updated, state.revisable, _RESTARTED, state.camera)
+            updated = replace(updated, tried=state.tried + len(revised))
         return updated, tuple(revised)
 
     def has_points(self, state: SolverState, ended: bool) -> bool:
@@ -434,7 +435,6 @@ def restart_if_misfit(state: Mapped, config: OnlineConfig) -> Mapped:
         trajectory=((last.pose, last.index),),
         baseline=LossBaseline(),
         lost_frames=0,
-        doubtful_frames=0,
         last_candidate=None,
         motion_references=(),
     )

@@ -191,6 +191,10 @@ class OnlineSolver:
             mask: ``(H, W)`` its initial mask.
         """
         searched = state.lost and should_retry(state.lost_frames)
+        maps = (state.object_map, *(other.object_map for other in state.inactive_maps))
+        if state.tried >= frame.index - min(one.keyframes[0].index for one in maps):
+            return replace(state, reinitialization=None), estimate
+        state = replace(state, tried=state.tried + 1 + searched * len(state.inactive_maps))
         for other in state.inactive_maps if searched else ():
             other_state = atlas.activate_map(state, other, frame.index)
             updated, found = self._track(other_state, frame, image, mask, self.options)

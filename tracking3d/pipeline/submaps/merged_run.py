@@ -60,7 +60,8 @@ def write_merged_run(
         own = [record for record in run.records if record.index in mine]
         records += _transform_records(own, run.similarity)
         taken += [frame for index, frame in run.kept.taken.items() if index in mine]
-        skipped += [frame for frame in run.kept.skipped if frame.index in mine]
+        # A picture that repeats the one before has its line already, and is a frame like any other from here on.
+        skipped += [frame for frame in run.kept.skipped if frame.index in mine and frame.repeats is None]
         _copy_masks(run.folder, folder, [record.index for record in own])
     lines = FrameLines(folder)
     try:

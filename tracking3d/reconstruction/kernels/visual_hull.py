@@ -1,4 +1,4 @@
-"""The robust visual hull, voxel by voxel; `tracking3d.reconstruction.shape` says what is computed."""
+"""The robust visual hull and the distance from a mesh, voxel by voxel; see `tracking3d.reconstruction.shape`."""
 
 from __future__ import annotations
 
@@ -65,3 +65,37 @@ def robust_hull(
         seen[n] = count
         rank = min(int(share * count) + least, count - 1)
         hull[n] = smallest[rank] if count > 0 else far
+
+
+@kernel("void(float64[:,:,::1], float64, float32[:,:,::1])")
+def surface_distance(corners: NDArray[Any], far: float, distance: NDArray[Any]) -> None:
+    """Fill ``distance`` (X, Y, Z) with that from the triangles (F, 3, 3), in voxels and cut off at ``far``.
+
+    The closest point of a triangle: Ericson, "Real-Time Collision Detection", 2005, section 5.1.5.
+    """
+    distance[:] = far * far
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for f in range(len(corners)):
+        a, ab, ac = corners[f, 0], corners[f, 1] - corners[f, 0], corners[f, 2] - corners[f, 0]
+        for k in range(3):
+            low[k] = max(np.ceil(corners[f, :, k].min() - far), 0)
+            high[k] = min(np.floor(corners[f, :, k].max() + far) + 1, distance.shape[k])
+        bb, bc, cc = (ab * ab).sum(), (ab * ac).sum(), (ac * ac).sum()
+        area = max(bb * cc - bc * bc, 1e-300)
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for k in range(low[2], high[2]):
+                    x, y, z = i - a[0], j - a[1], k - a[2]
+                    p, q = x * ab[0] + y * ab[1] + z * ab[2], x * ac[0] + y * ac[1] + z * ac[2]
+                    square = x * x + y * y + z * z
+                    s, t = (cc * p - bc * q) / area, (bb * q - bc * p) / area
+                    if s >= 0 and t >= 0 and s + t <= 1:
+                        found = square - s * p - t * q
+                    else:  # the nearest of the three edges
+                        s, t = min(max(p / max(bb, 1e-300), 0), 1), min(max(q / max(cc, 1e-300), 0), 1)
+                        found = min(square - s * (2 * p - s * bb), square - t * (2 * q - t * cc))
+                        edge, along = bb - 2 * bc + cc, bb - bc - p + q
+                        s = min(max(along / max(edge, 1e-300), 0), 1)
+                        found = min(found, square - 2 * p + bb - s * (2 * along - s * edge))
+                    distance[i, j, k] = min(distance[i, j, k], max(found, 0))
+    distance[:] = np.sqrt(distance)

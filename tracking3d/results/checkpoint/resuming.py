@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.results import layout
 from tracking3d.results.checkpoint.integrity import WholeLines
-from tracking3d.results.checkpoint.progress import checksum
+from tracking3d.results.checkpoint.progress import checksum, read_journal
 from tracking3d.results.files import is_locked
 from tracking3d.results.records import jsonable
 from tracking3d.results.run_reader import RunReader
@@ -121,8 +122,12 @@ def earlier_run(
 
 
 def _estimated(folder: Path) -> set[int]:
-    """The frames that have an estimate in a run, up to a damaged line."""
-    return {record.index for record in WholeLines.of(folder / layout.FRAMES).records}
+    """The frames that have an estimate in a run, up to a damaged line, or will have that of the picture before."""
+    estimated = {record.index for record in WholeLines.of(folder / layout.FRAMES).records}
+    with suppress(OSError, ValueError):  # of a journal that is damaged an earlier state is taken
+        _, skipped = read_journal((folder / layout.STATE / layout.JOURNAL).read_bytes())
+        estimated |= {one.index for one in skipped if one.repeats is not None}
+    return estimated
 
 
 def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:

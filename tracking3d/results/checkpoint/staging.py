@@ -176,12 +176,12 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
         try:
             state = json.loads(milestones[-1].path.read_bytes())
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
-            taken, _ = read_journal(journal)
+            taken, skipped = read_journal(journal)
             progress = RunProgress(**state["progress"])
             whole = not integrity.of_state(progress, taken)
         except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
             whole = False
-        if whole and not taken.keys() & set(changed):
+        if whole and not {*taken, *(one.index for one in skipped)} & set(changed):
             _copy_run(folder, stage, milestones, journal, progress.lines)
             return len(taken)
         milestones.pop()

@@ -182,7 +182,8 @@ def _parse_speed(
     whole = [one.whole for one in times]
     refinement = run.get("refinement") or {}
     again = float(refinement.get("seconds") or 0.0) if refinement.get("state") == "finished" else 0.0
-    causal = float(run["timings"]["seconds_total"]) - again
+    timings = run["timings"]  # of earlier versions without passes
+    causal = float(timings.get("passes", {}).get("tracking", timings["seconds_total"] - again))
     rest = causal - whole[0]
     return TrackSpeed(
         name=name,

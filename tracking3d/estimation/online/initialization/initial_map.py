@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -184,8 +185,9 @@ def initialize_without_points(
 def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> ObjectMap:
     """A map without points from the same keyframes, restarted with other rotations, if it explains them better.
 
-    More views tell hypotheses apart that the first views do not. The present rotations compete, the reversed ones, and
-    those near both; the shape begins as the prototype. At most `_VIEWS_AGAIN` keyframes stay.
+    More views tell hypotheses apart that the first views do not. The present rotations compete, the reversed ones,
+    those near both, and those that go on from the first views; the shape begins as the prototype. At most
+    `_VIEWS_AGAIN` keyframes stay.
 
     Args:
         object_map: The map.
@@ -200,6 +202,7 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     reverse = reverse_rotations(chosen, camera)
     poses = [present, reverse]
     poses += [one for other in (present, reverse) for one in vary_rotations(chosen, other, camera)]
+    poses += continue_rotation(chosen, camera)
     blank = replace(object_map, vertices=object_map.shape.rest, free_axis=None)
     tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
     (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
@@ -311,6 +314,8 @@ PROFILES = ((0.0, 1.0), (0.5, 1.0), (0.0, 0.5))
 DIRECTIONS = 8
 _VARIED_EXTENTS = (0.6, 1.6)  # times the rotation (chosen)
 _VARIED_AXES = (-22.0, 22.0)  # degrees in the image plane, half of what lies between two directions
+_FASTER = (1.0, 1.6)  # times the speed of the first views at which a rotation goes on (chosen)
+_OUTLINE_SIDE = 48  # pixels of the pictures in which outlines are compared (chosen)
 _VARIED_SPIN = (-0.5, 0.5)  # rotation about the line of sight, as a share of the rest (chosen)
 
 
@@ -362,6 +367,44 @@ def reverse_rotations(views: list[Keyframe], camera: Camera) -> list[Pose]:
     R = torch.stack([view.pose.R for view in views]).double().cpu().numpy()
     steps = Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).as_rotvec()
     return _turn_by_steps(views, steps * np.array([-1.0, -1.0, 1.0]), camera)
+
+
+def continue_rotation(views: list[Keyframe], camera: Camera) -> list[list[Pose]]:
+    """Poses that rotate on and on as in the first views, or come back where the outlines do, in both senses.
+
+    A side that turns into view is a guess at first, and tracking it lags behind.
+    """
+    R = torch.stack([view.pose.R for view in views]).double().cpu().numpy()
+    time = np.array([view.index - views[0].index for view in views])
+    last = max(int(np.count_nonzero(time <= _ROTATION_FRAMES)) - 1, 1)
+    speed = Rotation.from_matrix(R[last] @ R[0].T).as_rotvec() / time[last]
+    back = np.where((time[1:] + time[:-1]) / 2 < _turning_time(views), 1.0, -1.0)
+    ways = [_FASTER[0] * np.diff(time), _FASTER[1] * np.diff(time), back * np.diff(time)]
+    senses = [speed, speed * np.array([-1.0, -1.0, 1.0])]
+    return [_turn_by_steps(views, way[:, None] * sense, camera) for sense in senses for way in ways]
+
+
+def _turning_time(views: list[Keyframe]) -> float:
+    """The frames after the first view about which the outlines are most alike when time is mirrored."""
+    outlines = []
+    for view in views:
+        assert view.mask is not None
+        y, x = np.nonzero(view.mask)
+        scale = _OUTLINE_SIDE / (1.8 * math.sqrt(len(x)))
+        place = _OUTLINE_SIDE / 2 - scale * np.array([x.mean(), y.mean()])
+        to_outline = np.array([[scale, 0, place[0]], [0, scale, place[1]]])
+        mask = cv2.warpAffine(view.mask.astype(np.float32), to_outline, (_OUTLINE_SIDE, _OUTLINE_SIDE))
+        outlines.append(mask > 0.5)
+    time = np.array([view.index - views[0].index for view in views])
+
+    def difference(turn: float) -> float:
+        """Mean 1 - IoU of the outlines with those of the views at the mirrored times."""
+        near = np.abs(2 * turn - time[:, None] - time[None]).argmin(1)
+        pairs = [(a, b) for a, b in enumerate(near) if 0 <= 2 * turn - time[a] <= time[-1] and a != b]
+        alike = [(outlines[a] & outlines[b]).sum() / (outlines[a] | outlines[b]).sum() for a, b in pairs]
+        return 1 - float(np.mean(alike)) if alike else 1.0
+
+    return min((float(turn) for turn in time[-1] * np.linspace(0.25, 0.75, 11)), key=difference)
 
 
 def _turn_by_steps(views: list[Keyframe], steps: NDArray[np.float64], camera: Camera) -> list[Pose]:

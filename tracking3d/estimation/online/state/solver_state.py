@@ -97,6 +97,7 @@ class Mapped(_AnyState):
     doubtful_frames: int = 0  # how many frames in a row have been lost or of low confidence
     misfits: int = 0  # how many frames in a row a map without points has explained worse than its first ones
     restarts: int = 0  # how often the map was restarted for that
+    tried: int = 0  # frames that were shown to an inactive map, to a second one, or to a restarted one
     # the best pose of the last frame, if that had a mask and the pose was rejected
     last_candidate: Pose | None = None
     # poses and indices of the last tracked frames, for the motion model

@@ -86,9 +86,9 @@ def score_models(
 def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tracking3d.reconstruction.rebuild import score_run
+    from tracking3d_bench.evaluation.held_out_frames import score_held_out_frames
 
-    found = asdict(score_run(run, source, largest))
+    found = asdict(score_held_out_frames(run, source, largest))
     if clip is not None:
         found |= asdict(_against_truth(run, clip))
     return found
