@@ -23,7 +23,9 @@ def made(monkeypatch) -> list[Path]:
     """The folders whose shape is made; their frames turn by 44 degrees."""
     folders: list[Path] = []
     poses = [Rotation.from_euler("y", 4 * n, degrees=True).as_matrix() for n in range(12)]
-    frames = [SimpleNamespace(T_cam_obj=R, refined=True, status=Status.TRACKED) for R in poses]
+    frames = [
+        SimpleNamespace(T_cam_obj=R, refined=True, status=Status.TRACKED, free_axis=None) for R in poses
+    ]
     monkeypatch.setattr(
         record,
         "RunReader",

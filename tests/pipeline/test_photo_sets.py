@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from functools import cache
 from types import SimpleNamespace
 from typing import cast
@@ -116,7 +117,8 @@ def test_a_start_that_explains_no_more_than_there_is_stays_out():
     session = SimpleNamespace(
         start_from_photos=lambda photos: (attempt, ""), adopt=lambda attempt: pytest.fail("no better")
     )
-    assert lost_frames.start_from_photos(session, None, masks) == (None, "")
+    tried = lost_frames.TriedFrames(8, Counter())
+    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "")
 
 
 def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
