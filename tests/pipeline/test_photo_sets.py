@@ -119,6 +119,16 @@ def test_a_start_that_explains_no_more_than_there_is_stays_out():
     )
     tried = lost_frames.TriedFrames(8, Counter())
     assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "")
+    assert tried.left == 0
+
+
+def test_photos_that_are_not_joined_leave_the_other_tries_their_frames():
+    causal = {index: SimpleNamespace(status=status) for index, status in enumerate(BAD)}
+    masks = SimpleNamespace(estimates=SimpleNamespace(causal=causal), has_mask=lambda index: True)
+    session = SimpleNamespace(start_from_photos=lambda photos: (None, "take more"))
+    tried = lost_frames.TriedFrames(8, Counter())
+    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "take more")
+    assert tried.left == 8
 
 
 def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():

@@ -131,13 +131,14 @@ def start_from_photos(
     def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
         wanted = frozenset(indices)
         frames = (frame for frame in read_again(source) if frame.index in wanted)
-        return masks.with_masks(tried.count("photos", frames))
+        return masks.with_masks(frames)
 
     report_progress("joining photos")
     seen = tuple(sorted(index for index in causal if masks.has_mask(index)))
     attempt, advice = session.start_from_photos(PhotoSet(seen, read))
-    if attempt is None:
+    if attempt is None:  # nothing but matches, which hardly cost anything, was tried
         return None, advice
+    tried.by["photos"] += len(attempt.confidence)
     before = sum(one.status is Status.TRACKED for one in causal.values())
     explained = sum(one >= TRACKED_CONFIDENCE for one in attempt.confidence.values())
     _log.info("Photos joined: %d of %d frames explained, %d before.", explained, len(causal), before)
