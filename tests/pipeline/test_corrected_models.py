@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from refining_solver import StandInSolver
 
@@ -20,6 +21,7 @@ from tracking3d.results.checkpoint import folder
 from tracking3d.results.checkpoint.staging import take_over
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.trackers.prompts.corrections import Correction
@@ -83,6 +85,17 @@ def test_a_reconstructed_shape_is_reconstructed_again_before_the_run_is_replaced
     assert (run / layout.ONLINE / layout.FEATURES).is_file()
     assert RunReader(run).description["shape"] == "A new shape."
     assert not (run / layout.CORRECTING).exists()
+
+
+def test_a_shape_that_hardly_any_frame_contradicts_stays(run, rebuilt, monkeypatch):
+    note_in_run(run, {"shape": "Better."})
+    monkeypatch.setattr(rebuild, "_MOST_CHANGED", 1.0)
+    before = load_model(run)
+    correct_run(run, GIVEN)
+    assert rebuilt == []
+    assert RunReader(run).description["shape"] == "Better."
+    np.testing.assert_allclose(load_model(run).vertices, before.vertices)
+    assert (run / layout.ONLINE / layout.FEATURES).is_file()
 
 
 def test_until_the_shape_is_there_the_run_stays_and_the_same_call_makes_only_that(run, rebuilt, monkeypatch):

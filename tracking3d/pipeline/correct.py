@@ -106,7 +106,9 @@ def replaced_by_correction(folder: Path, report: bool = True) -> list[str]:
     """
     said = []
     if keeps_shape(folder):
-        said.append(f"The shape of the model of {folder} is reconstructed again after the correction.")
+        said.append(
+            f"The shape of the model of {folder} is reconstructed again after the correction, unless few frames change."
+        )
     if (folder / layout.EXPORT).is_dir():
         said.append(
             f"{folder / layout.EXPORT} shows the run as it is now and becomes {layout.EXPORT_BEFORE}; export the "

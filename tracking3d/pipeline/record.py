@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -295,8 +295,15 @@ def begin_recording(
 
 
 def _reconstruct_shape_again(corrected: Path, stage: Path, opened: OpenTracking) -> None:
-    """Reconstruct the shape of a corrected run if that of the run was, before it takes the run's place."""
-    if is_finished(stage) and keeps_shape(corrected):
+    """Give a corrected run a shape from all frames if the run had one, before it takes the run's place."""
+    from tracking3d.reconstruction.rebuild import keep_shape  # slow to import, and only needed at the end
+
+    if not (is_finished(stage) and keeps_shape(corrected)):
+        return
+    kept = False
+    with suppress(InputError):  # the run that is corrected may be damaged
+        kept = keep_shape(corrected, stage)
+    if not kept:
         make_final_shape(stage, opened.config, opened.source, always=True)
 
 

@@ -392,6 +392,8 @@ def move_surface(
 
 
 TURNS = 2
+STILL = np.deg2rad(0.05)
+"""Turn of a view below which it is not drawn and adjusted once more (measured: what follows is a tenth of it)."""
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
@@ -426,7 +428,10 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
             _FIXED * scene.radius,
         )
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
-        view = redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+        before, view = view, redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+        turned = view.T_cam_obj[:3, :3] @ before.T_cam_obj[:3, :3].T
+        if Rotation.from_matrix(turned).magnitude() < STILL:
+            break
     return view, share
 
 

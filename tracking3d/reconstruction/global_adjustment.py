@@ -38,9 +38,9 @@ ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
 _DRAWN = 480
 """Views that all rounds draw together, if that allows for more than the least of them."""
-_USUAL_VIEWS = 48
-"""Views that are bundled; all that were kept, if these share too few landmarks. With more views the poses of
-box_in_hand were no better, and the time of a round grows with their square."""
+_USUAL_VIEWS, _DEGREES_A_VIEW = (24, 48), 5.0
+"""Least and most views that are bundled, and the turn between two of them, which share most landmarks then; all that
+were kept, if these share too few. The time of a round grows with the square of their number."""
 _FRAMES_A_VIEW = 5  # frames of a long video for each view that is bundled
 _LEAST_VIEWS = 4
 # Deviations by which the default lens is off where it is not taken, and degrees that views are then apart (chosen: the
@@ -101,7 +101,10 @@ class GlobalAdjustment:
         if len(self._views) < _LEAST_VIEWS or not has_texture(self._strengths):
             self._views = {}
             return
-        scene = self._refine(max(_USUAL_VIEWS, self._frames // _FRAMES_A_VIEW))
+        R = np.stack([self._views[index].T_cam_obj[:3, :3] for index in sorted(self._views)])
+        turned = np.degrees(Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).magnitude().sum())
+        views = int(np.clip(turned / _DEGREES_A_VIEW, *_USUAL_VIEWS))
+        scene = self._refine(max(views, self._frames // _FRAMES_A_VIEW))
         if not is_supported(scene) and len(self._bundled) < len(self._views):
             scene = self._refine(len(self._views))  # nearer to one another, views share more landmarks
         self._views = {}

@@ -144,6 +144,13 @@ class Grid:
         x, y, z = np.ceil((high - low + 2 * padding) / spacing).astype(int) + 1
         return cls(low - padding, spacing, (int(x), int(y), int(z)))
 
+    def around_centres(self, kept: NDArray[np.bool_], spacing: float) -> Grid:
+        """The grid of another spacing that reaches one step of this one beyond its centres ``(X * Y * Z,)`` kept."""
+        at = np.argwhere(kept.reshape(self.shape))
+        low, high = (at.min(0) - 1, at.max(0) + 1) if len(at) else (0, np.array(self.shape) - 1)
+        x, y, z = np.ceil((high - low) * self.spacing / spacing).astype(int) + 1
+        return Grid(self.origin + self.spacing * low, spacing, (int(x), int(y), int(z)))
+
     @property
     def points(self) -> FloatArray:
         """``(X * Y * Z, 3)`` centres; z runs fastest."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.reconstruction.run_views import (
     RunViews,
     collect_views,
@@ -25,8 +26,10 @@ from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.redrawing import redraw_contact_sheet
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import load_own_model, read_own_records
 from tracking3d.runtime.progress import report_progress
 from tracking3d.scene.view import ObjectView
 from tracking3d.video.source import FrameSource
@@ -144,6 +147,59 @@ def reshape_run(
         export_mesh(kept, online, run.unit)
     _replace_mesh(run, model)
     return ShapedRun(model, len(views.textures), True, made.sentence)
+
+
+_MOVED, _AGREEMENT, _MOST_CHANGED = 0.05, 0.98, 0.1
+"""Degrees by which a pose, and IoU with which a mask, is the same; and the share of frames whose may be others while
+the shape that they all make stays (chosen)."""
+
+
+def keep_shape(earlier: Path, folder: Path) -> bool:
+    """Give a corrected run the shape that it had before, unless lens, object frame or much of its frames has changed.
+
+    Args:
+        earlier: The run before it was corrected.
+        folder: The corrected run, finished, with the mesh of its online map.
+
+    Returns:
+        Whether it was done.
+
+    Raises:
+        InputError: If one of them is damaged.
+        OutputError: If the mesh cannot be written.
+    """
+    before, run = RunReader(earlier), RunReader(folder)
+    sentence = before.description.get("shape")
+    same_lens = math.isclose(before.camera.fx, run.camera.fx, rel_tol=1e-6)
+    if not sentence or before.description.get(EXTENDS) or not same_lens:
+        return False
+    records = {one.index: one for one in read_own_records(before) if one.status is Status.TRACKED}
+    after = {one.index: one for one in run.frames}
+    changed = sum(not _is_same_view(before, run, one, after.get(index)) for index, one in records.items())
+    if not records or changed > _MOST_CHANGED * len(records):
+        return False
+    if (before.mesh_folder / layout.ONLINE / layout.FEATURES).is_file():
+        kept = run.mesh_folder / layout.ONLINE
+        kept.mkdir(exist_ok=True)
+        export_mesh(kept, online_model(run), run.unit)
+        _replace_mesh(run, load_own_model(before, before.mesh_folder))
+    note_in_run(folder, {"shape": sentence})
+    return True
+
+
+def _is_same_view(before: RunReader, run: RunReader, one: FrameRecord, other: FrameRecord | None) -> bool:
+    """Whether a frame shows the object at the pose, and in the mask, that it had before."""
+    if other is None or not np.isfinite(other.T_cam_obj).all():
+        return False
+    moved = np.linalg.inv(one.T_cam_obj) @ other.T_cam_obj
+    turned = math.degrees(math.acos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1)))
+    far = np.linalg.norm(moved[:3, 3]) / np.linalg.norm(one.T_cam_obj[:3, 3])
+    if max(turned, math.degrees(far)) > _MOVED:
+        return False
+    paths = before.mask_path(one.index), run.mask_path(one.index)
+    if paths[0].samefile(paths[1]):
+        return True
+    return (mask_iou_or_none(before.mask(one.index), run.mask(one.index)) or 0.0) > _AGREEMENT
 
 
 def restore_online_mesh(folder: Path) -> bool:

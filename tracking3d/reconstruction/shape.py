@@ -128,26 +128,28 @@ def _volume(
     vertices = np.concatenate([points for points, _ in starts])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
-    bounds = {}
-    for cells in (_COARSE, _CELLS):
-        grid = Grid.around(vertices, cells, _MARGIN)
-        measured = start_in_thread(
-            partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads()
-        )
-        hull, _ = carve_hull(grid.points, views, 2 * truncation)
-        prior = measured()
-        bounds[cells] = grid, hull, restore_uncovered(grid, hull, prior, references)
-    maps = depth_maps(
-        views,
-        references,
-        _guide(*bounds[_COARSE], *starts[0]),
-        _REACH * diagonal,
-        _STEPS,
-    )
-    grid, hull, prior = bounds[_CELLS]
+    coarse = Grid.around(vertices, _COARSE, _MARGIN)
+    hull, prior = _bounds(coarse, starts, views, references, truncation)
+    guide = _guide(coarse, hull, prior, *starts[0])
+    maps = depth_maps(views, references, guide, _REACH * diagonal, _STEPS)
+    grid = coarse.around_centres(hull > -coarse.spacing, coarse.spacing * _COARSE / _CELLS)
+    hull, prior = _bounds(grid, starts, views, references, truncation)
     total, weight = depth_evidence(grid.points, maps, truncation)
     fused = fuse_depth(grid.shape, hull, prior, total, weight, truncation)
     return grid, *complete_by_symmetry(grid, fused, hull / truncation, references)
+
+
+def _bounds(
+    grid: Grid,
+    starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
+    views: Sequence[ObjectView],
+    references: Sequence[ObjectView],
+    truncation: float,
+) -> tuple[FloatArray, FloatArray]:
+    """``(N,)`` signed distances from the hull, and from the shapes at hand where views do not show that they lack."""
+    measured = start_in_thread(partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads())
+    hull, _ = carve_hull(grid.points, views, 2 * truncation)
+    return hull, restore_uncovered(grid, hull, measured(), references)
 
 
 def _start_distance(

@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from tracking3d.results.mesh_export import load_model, split_mesh
 from tracking3d.results.notes import DoubtfulRange, doubtful_ranges, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.concurrency import start_in_thread
 from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.ui.report import figures
 from tracking3d.ui.report.curves import Curve, curve, stretches
@@ -63,6 +65,8 @@ def write_report(folder: Path, turntable: bool = True) -> Path:
     try:
         model, no_model = _model_of(run)
         front = _front(run, model)
+        shown = model if turntable else None
+        movie = start_in_thread(partial(_write_movie, folder, shown, front), cv2.getNumThreads())
         page = _page(run, model, front, no_model)
     except _DAMAGED as error:
         raise InputError(
@@ -70,9 +74,7 @@ def write_report(folder: Path, turntable: bool = True) -> Path:
         ) from error
     path = folder / layout.REPORT
     write_atomic(path, page)
-    if model is not None and turntable:
-        with writing(folder / layout.TURNTABLE):
-            write_turntable(folder / layout.TURNTABLE, model, front)
+    movie()
     return path
 
 
@@ -80,9 +82,13 @@ def write_turntable_of(folder: Path) -> None:
     """Write the turntable movie of a run's model alone; see `write_report`."""
     run = RunReader(folder)
     model, _ = _model_of(run)
+    _write_movie(folder, model, _front(run, model))
+
+
+def _write_movie(folder: Path, model: ObjectModel | None, front: NDArray[np.float64]) -> None:
     if model is not None:
         with writing(folder / layout.TURNTABLE):
-            write_turntable(folder / layout.TURNTABLE, model, _front(run, model))
+            write_turntable(folder / layout.TURNTABLE, model, front)
 
 
 def _model_of(run: RunReader) -> tuple[ObjectModel | None, str]:
@@ -475,12 +481,12 @@ def write_turntable(path: Path, model: ObjectModel, rotation: NDArray[np.float64
     Raises:
         OutputError: If it cannot be written.
     """
-    partial, texture = partial_path(path), texture_of_views(model, SIDE)
+    unfinished, texture = partial_path(path), texture_of_views(model, SIDE)
     try:
-        with VideoWriter(partial, FPS, (SIDE, SIDE)) as video:
+        with VideoWriter(unfinished, FPS, (SIDE, SIDE)) as video:
             for yaw in report_each("turntable", np.arange(VIEWS) * 360.0 / VIEWS):
                 turned = Rotation.from_euler("yx", [yaw, PITCH], degrees=True).as_matrix() @ rotation
                 video.write(render_view(model, turned, SIDE, texture))
-        partial.replace(path)
+        unfinished.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
