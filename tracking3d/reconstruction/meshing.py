@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import trimesh
 
 _log = logging.getLogger(__name__)
 SMALLEST_PIECE = 0.1
@@ -25,6 +28,7 @@ def extract_surface(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
         grid: Grid of the volume.
         inside: ``(X * Y * Z,)`` signed distance, positive inside.
     """
+    import trimesh  # slow to import, and only needed at the end
     from skimage.measure import marching_cubes
 
     volume = np.full(np.add(grid.shape, 2), -abs(float(inside.min())) - grid.spacing, np.float32)
@@ -38,6 +42,8 @@ def extract_surface(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
 
 def main_pieces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The largest piece, and others that are no crumbs; cavities within it are filled."""
+    import trimesh  # slow to import
+
     pieces = mesh.split(only_watertight=True)
     solid = [piece for piece in pieces if piece.volume > 0]
     if not solid:
@@ -67,6 +73,7 @@ def simplify(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 def decimate_roughly(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """With about so many faces at most, sound or not."""
     import fast_simplification
+    import trimesh  # slow to import
 
     if faces >= len(mesh.faces):
         return mesh

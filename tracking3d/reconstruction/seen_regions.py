@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
@@ -181,6 +180,8 @@ def seen_vertices(
         faces: ``(F, 3)``.
         views: The frames.
     """
+    import trimesh  # slow to import, and only needed at the end
+
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     tolerance = 0.01 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     seen = np.zeros(len(vertices), np.bool_)

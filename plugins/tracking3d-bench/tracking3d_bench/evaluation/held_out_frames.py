@@ -89,6 +89,10 @@ def _compare(model: ObjectModel, view: ObjectView) -> tuple[float, float, float]
 _TEXTURE_VIEWS = 24
 
 
+class NothingHeldOutError(InputError):
+    """Too few frames of a run are reliable."""
+
+
 def score_held_out_frames(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
     """How well the mesh of a run predicts frames that it was not made from.
 
@@ -125,7 +129,7 @@ def score_held_out_frames(folder: Path, source: str | None = None, largest: int 
         if len(left_out) > MOST_LEFT_OUT:
             left_out = left_out[::2]
     if not left_out:
-        raise InputError(
+        raise NothingHeldOutError(
             f"Only {count} frames of the run {folder} are reliable; none can be held out to test its model."
         )
     return held_out_scores(bake_texture(model, views, largest), used, left_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -86,11 +87,13 @@ def score_models(
 def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tracking3d_bench.evaluation.held_out_frames import score_held_out_frames
+    from tracking3d_bench.evaluation.held_out_frames import NothingHeldOutError, score_held_out_frames
 
-    found = asdict(score_held_out_frames(run, source, largest))
-    if clip is not None:
-        found |= asdict(_against_truth(run, clip))
+    if clip is None:
+        return asdict(score_held_out_frames(run, source, largest))
+    found = asdict(_against_truth(run, clip))
+    with suppress(NothingHeldOutError):  # of a plain object no frame may be reliable, and the true shape is known all the same
+        found |= asdict(score_held_out_frames(run, source, largest))
     return found
 
 
