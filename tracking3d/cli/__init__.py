@@ -6,7 +6,9 @@ commands of their own, see `tracking3d.cli.plugged_commands`.
 
 from __future__ import annotations
 
+import ctypes
 import os
+from contextlib import suppress
 
 import typer
 
@@ -76,4 +78,19 @@ def main() -> None:
     """Entry point of the console script."""
     # Matrices are small here: the threads of OpenBLAS, by default one per core, would wait longer than they work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _share_heaps()
     app()
+
+
+_ARENAS, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1  # M_ARENA_MAX and others in glibc's malloc.h
+_HEAPS, _LARGE = 2, 32 << 20  # and bytes; 4 MB save 40 MB more, and a third of the shape's time goes to the kernel
+
+
+def _share_heaps() -> None:
+    """Let all threads share two heaps of the C library: with one each, a run takes an eighth more memory."""
+    if "MALLOC_ARENA_MAX" in os.environ:
+        return
+    with suppress(OSError, AttributeError, TypeError):  # C libraries other than glibc
+        set_option = ctypes.CDLL(None).mallopt
+        for option, value in ((_ARENAS, _HEAPS), (_MMAP_THRESHOLD, _LARGE), (_TRIM_THRESHOLD, _LARGE)):
+            set_option(option, value)

@@ -114,9 +114,11 @@ class LandmarkScene:
         )
 
 
-def refine_through(scene: LandmarkScene, rounds: int, camera: Camera) -> LandmarkScene:
+def refine_through(
+    scene: LandmarkScene, rounds: int, camera: Camera, significance: float = 0.0
+) -> LandmarkScene:
     """`refine_scene`, with the focal length if it is not given and the solved one is within the range of lenses."""
-    refined = refine_scene(scene, rounds, free_focal=camera.assumed)
+    refined = refine_scene(scene, rounds, free_focal=camera.assumed, significance=significance)
     return refined if camera.may_have(refined.focal_factor) else refine_scene(scene, rounds)
 
 
@@ -124,6 +126,7 @@ def refine_scene(
     scene: LandmarkScene,
     rounds: int = ROUNDS,
     free_focal: bool = False,
+    significance: float = 0.0,
 ) -> LandmarkScene:
     """Refine surface and poses from the images until the rotations converge.
 
@@ -134,12 +137,13 @@ def refine_scene(
         scene: As a run left it.
         rounds: How many times at most.
         free_focal: Whether to estimate the focal length too, because it is not given.
+        significance: Of its change, in standard deviations, from which on it is taken; see `bundle`.
     """
     done, last = 0, rounds
     while done < last:
         report_progress("refining poses", done, last)
         done += 1
-        before, scene = scene, _refine_once(scene, free_focal)
+        before, scene = scene, _refine_once(scene, free_focal, significance)
         if scene.reversal is not before.reversal:
             last = done + rounds  # all of it is new
         elif _rotation_between(before, scene) < _SETTLED:
@@ -197,7 +201,7 @@ def _rotation_between(before: LandmarkScene, after: LandmarkScene) -> float:
     return float(np.median((turned.mean().inv() * turned).magnitude()))
 
 
-def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
+def _refine_once(scene: LandmarkScene, free_focal: bool, significance: float = 0.0) -> LandmarkScene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     if not there:
         return scene
@@ -233,7 +237,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
         vertices = other.reversal.surface(vertices, points, found.points)
         scene = replace(scene, reversal=other.reversal, may_reverse=False)
     elif free_focal:
-        found = solved(points, T_cam_obj=T, begun=found)
+        found = solved(points, T_cam_obj=T, begun=found, significance=significance)
     if other is not None and other.is_hopeless:
         scene = replace(scene, may_reverse=False)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
