@@ -127,21 +127,6 @@ def test_a_lens_that_nobody_gave_is_found_where_perspective_tells_it(factor):
     assert given.cost > found.cost
 
 
-def test_a_lens_stays_unless_its_change_is_as_significant_as_asked():
-    measured, lens, T = seen_through(1.05, noise=0.1)
-    deviation = np.full((9, 40), 0.1)
-    given = bundle(POINTS, lens, T, measured, deviation, 0.1)
-    found = bundle(POINTS, lens, T, measured, deviation, 0.1, begun=given)
-    deviations = abs(np.log(found.focal_factor)) / found.focal_deviation
-    kept, changed = (
-        bundle(POINTS, lens, T, measured, deviation, 0.1, begun=given, significance=share * deviations)
-        for share in (1.1, 0.9)
-    )
-    assert found.focal_factor != 1
-    assert (kept.focal_factor, kept.focal_deviation) == (1, found.focal_deviation)
-    assert changed.focal_factor == found.focal_factor
-
-
 def test_noise_is_no_proof_of_another_lens():
     measured, lens, T = seen_through(1.0, noise=1.0)
     given = bundle(POINTS, lens, T, measured, np.full((9, 40), 1.0), 0.1)

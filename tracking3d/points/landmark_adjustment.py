@@ -114,11 +114,9 @@ class LandmarkScene:
         )
 
 
-def refine_through(
-    scene: LandmarkScene, rounds: int, camera: Camera, significance: float = 0.0
-) -> LandmarkScene:
+def refine_through(scene: LandmarkScene, rounds: int, camera: Camera) -> LandmarkScene:
     """`refine_scene`, with the focal length if it is not given and the solved one is within the range of lenses."""
-    refined = refine_scene(scene, rounds, free_focal=camera.assumed, significance=significance)
+    refined = refine_scene(scene, rounds, free_focal=camera.assumed)
     return refined if camera.may_have(refined.focal_factor) else refine_scene(scene, rounds)
 
 
@@ -126,7 +124,6 @@ def refine_scene(
     scene: LandmarkScene,
     rounds: int = ROUNDS,
     free_focal: bool = False,
-    significance: float = 0.0,
 ) -> LandmarkScene:
     """Refine surface and poses from the images until the rotations converge.
 
@@ -137,13 +134,12 @@ def refine_scene(
         scene: As a run left it.
         rounds: How many times at most.
         free_focal: Whether to estimate the focal length too, because it is not given.
-        significance: Of its change, in standard deviations, from which on it is taken; see `bundle`.
     """
     done, last = 0, rounds
     while done < last:
         report_progress("refining poses", done, last)
         done += 1
-        before, scene = scene, _refine_once(scene, free_focal, significance)
+        before, scene = scene, _refine_once(scene, free_focal)
         if scene.reversal is not before.reversal:
             last = done + rounds  # all of it is new
         elif _rotation_between(before, scene) < _SETTLED:
@@ -201,7 +197,7 @@ def _rotation_between(before: LandmarkScene, after: LandmarkScene) -> float:
     return float(np.median((turned.mean().inv() * turned).magnitude()))
 
 
-def _refine_once(scene: LandmarkScene, free_focal: bool, significance: float = 0.0) -> LandmarkScene:
+def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     if not there:
         return scene
@@ -237,7 +233,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool, significance: float = 0
         vertices = other.reversal.surface(vertices, points, found.points)
         scene = replace(scene, reversal=other.reversal, may_reverse=False)
     elif free_focal:
-        found = solved(points, T_cam_obj=T, begun=found, significance=significance)
+        found = solved(points, T_cam_obj=T, begun=found)
     if other is not None and other.is_hopeless:
         scene = replace(scene, may_reverse=False)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))

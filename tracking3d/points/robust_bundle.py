@@ -98,7 +98,6 @@ def bundle(
     held: float,
     begun: BundleResult | None = None,
     turns: int = TURNS,
-    significance: float = 0.0,
 ) -> BundleResult:
     """Move points and poses so that they agree with the measurements.
 
@@ -110,8 +109,6 @@ def bundle(
             and it has proof: all focal lengths may change by one factor. Errors along a track hang together, so that a
             whole track counts as much as one independent measurement, and has to pay for how far the lens changes.
         turns: The most steps that are tried.
-        significance: Standard deviations by which the focal length has to change, or it stays. Views that have turned
-            little, and a surface that is still rough, err by more than the deviation that the measurements have.
     """
     known = np.isfinite(deviation) & np.isfinite(measured).all(2)
     known &= (known.sum(1) >= LEAST_MEASURED)[:, None]
@@ -145,9 +142,7 @@ def bundle(
         # The loss is half of minus twice the logarithm of the likelihood, in units of squared outliers.
         information = 0.5 * _OUTLIER**2 * found.focal_curvature / tracked
         deviation_of_lens = 1 / math.sqrt(information + _LENS**-2)
-        change = abs(math.log(found.focal_factor))
-        unclear = deviation_of_lens > LENS_KNOWN or change < significance * deviation_of_lens
-        if unclear or not gain > (change / _LENS) ** 2:
+        if deviation_of_lens > LENS_KNOWN or not gain > (math.log(found.focal_factor) / _LENS) ** 2:
             return replace(begun, focal_deviation=deviation_of_lens)
     T = T_cam_obj.copy()
     T[:, :3, :3], T[:, :3, 3] = found.R, found.t

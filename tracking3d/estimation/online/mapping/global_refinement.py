@@ -94,9 +94,6 @@ _LEAST_KEYFRAMES = 4
 _NEW_SHARE = 0.1
 """Share of the keyframes that are new, from which on the map is refined again: a refinement takes time for every
 keyframe, so that a frame of a long video costs as much as one of a short one."""
-_LENS_SIGNIFICANCE = 3.0
-"""Standard deviations by which a guessed focal length has to change while frames come (measured: estimates of the first
-keyframes are off by up to four; lens and poses followed each of them)."""
 _SHAPE_ROUNDS = 2
 """Of the surface fit afterwards: dense landmarks leave the rim of the surface where they found it."""
 _TRACK_DEVIATION = 1.0  # pixels, of points that were tracked from frame to frame
@@ -141,7 +138,7 @@ def _refine_map(
     scene = draw_keyframes(object_map, camera, list(range(len(object_map.keyframes))))
     if scene.views[0] is None or sum(view is not None for view in scene.views) < _LEAST_KEYFRAMES:
         return None
-    scene = refine_through(scene, _ROUNDS, camera, _LENS_SIGNIFICANCE)
+    scene = refine_through(scene, _ROUNDS, camera)
     if not is_supported(scene):
         return None
     if scene.focal_factor != 1:
