@@ -11,11 +11,12 @@ from torch.nn import functional
 
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
+from tracking3d.features.networks.catalogue import description_names
 from tracking3d.features.networks.session import Network
 from tracking3d.features.onnx.encoder import (
+    PACKAGE,
     EncoderDescription,
     OnnxEncoder,
-    builtin_encoder_descriptions,
     load_encoder_description,
 )
 from tracking3d.features.protocol import FeatureEncoder
@@ -226,8 +227,8 @@ def test_an_empty_description_is_the_usual_network(tmp_path):
 
 
 def test_every_description_that_comes_along_is_valid_and_says_where_from():
-    assert builtin_encoder_descriptions() == ["alike", "aliked", "s2dnet_original", "xfeat"]
-    for name in builtin_encoder_descriptions():
+    assert description_names(PACKAGE) == ["alike", "aliked", "s2dnet_original", "xfeat"]
+    for name in description_names(PACKAGE):
         assert load_encoder_description(name).link.startswith("https://")
 
 

@@ -17,7 +17,7 @@ from tracking3d.points import landmark_adjustment
 from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.points.warping import Chain
 from tracking3d.reconstruction import global_adjustment
-from tracking3d.reconstruction.global_adjustment import GlobalAdjustment
+from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, views_needed
 from tracking3d.results.records import FrameRecord
 
 YAWS = np.linspace(0, 48, 9)
@@ -261,6 +261,12 @@ def test_what_corners_say_of_a_plain_object_changes_nothing(monkeypatch):
     np.testing.assert_allclose(found, given)
 
 
+@pytest.mark.parametrize(("degrees", "bundled"), [(0, 24), (150, 30), (720, 48)])
+def test_as_many_views_are_bundled_as_the_turn_of_the_object_needs(degrees, bundled):
+    turns = Rotation.from_rotvec(np.deg2rad(np.linspace(0, degrees, 61))[:, None] * [0, 1, 0]).as_matrix()
+    assert views_needed(turns) == bundled
+
+
 @pytest.mark.parametrize("supported", [True, False])
 def test_few_views_are_bundled_and_all_of_them_only_where_those_share_too_few_landmarks(
     monkeypatch, supported
@@ -272,7 +278,7 @@ def test_few_views_are_bundled_and_all_of_them_only_where_those_share_too_few_la
         bundled.append(len(scene.views))
         return refine_through(scene, rounds, camera)
 
-    monkeypatch.setattr(global_adjustment, "_USUAL_VIEWS", 5)
+    monkeypatch.setattr(global_adjustment, "_USUAL_VIEWS", (5, 5))
     monkeypatch.setattr(global_adjustment, "refine_through", refine)
     if not supported:
         monkeypatch.setattr(global_adjustment, "is_supported", lambda scene: len(scene.views) > 5)

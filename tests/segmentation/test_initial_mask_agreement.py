@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.segmentation.initial_mask_agreement import InitialMaskAgreement
-from tracking3d.estimation.segmentation.whole_video import VideoSegmenter, draw_around_masks, segment_all
+from tracking3d.estimation.segmentation.whole_video import VideoSegmenter, draw_around_masks
 from tracking3d.geometry.camera import Camera
 from tracking3d.scene.surface import Drawn, draw_depth
 from tracking3d.scene.view import ObjectView
@@ -115,10 +115,15 @@ def segmenter_of(given):
     return known, spoiled
 
 
+def segmented(known: VideoSegmenter, frames: list[ObjectView]) -> list:
+    """Every frame of a video whose frames were all seen once, in their order."""
+    return [*(one for frame in frames for one in known.decide(frame)), *known.rest()]
+
+
 def test_exact_masks_come_back_from_the_whole_video():
     given = frames()
     known, spoiled = segmenter_of(given)
-    for (index, decided), one in zip(segment_all(known, spoiled), given, strict=True):
+    for (index, decided), one in zip(segmented(known, spoiled), given, strict=True):
         assert index == one.index and decided is not None
         assert np.count_nonzero(decided.mask ^ one.initial) < 0.005 * np.count_nonzero(one.initial)
 
@@ -129,7 +134,7 @@ def test_masks_that_agree_a_little_less_are_changed_a_little_more(monkeypatch):
     changed = []
     for agreement in (1.0, 0.91, 0.89, 0.8, 0.6, 0.0):
         monkeypatch.setattr(InitialMaskAgreement, "of_frame", lambda found, scene, n=agreement: n)
-        decided = [one for _, one in segment_all(known, spoiled) if one is not None]
+        decided = [one for _, one in segmented(known, spoiled) if one is not None]
         assert len(decided) == FRAMES
         differences = [np.count_nonzero(one.mask ^ given[one.index].initial) for one in decided]
         changed.append(sum(differences) / sum(np.count_nonzero(one.initial) for one in given))

@@ -24,7 +24,6 @@ from tracking3d.estimation.segmentation.whole_video import (
     alignment,
     draw_around_masks,
     edge_strength,
-    segment_all,
 )
 from tracking3d.estimation.segmentation.whole_video_weights import WEIGHTS
 from tracking3d.geometry.camera import Camera
@@ -70,12 +69,17 @@ def with_strip(mask: np.ndarray) -> np.ndarray:
     return mask | np.roll(mask, 7, 0)
 
 
+def segmented(known: VideoSegmenter, frames: list[ObjectView]) -> list:
+    """Every frame of a video whose frames were all seen once, in their order."""
+    return [*(one for frame in frames for one in known.decide(frame)), *known.rest()]
+
+
 def looked_at(frames: list[ObjectView]) -> dict[int, np.ndarray | None]:
     known = VideoSegmenter(CAMERA, VERTICES, FACES, {one.index: one.confidence for one in frames})
     for one in frames:
         known.see(one)
     known.settle()
-    found = list(segment_all(known, frames))
+    found = list(segmented(known, frames))
     assert [index for index, _ in found] == [one.index for one in frames]
     for _, decided in found:
         if decided is not None:
@@ -121,7 +125,7 @@ def test_only_masks_that_something_contradicts_are_decided_where_masks_may_be_ke
     known.settle()
     assert known.kept == {1, *range(4, 12)}
     assert [index for index in range(12) if known.needs(index)] == list(range(12))  # they tell the motion
-    found = dict(segment_all(known, frames))
+    found = dict(segmented(known, frames))
     assert {index for index, decided in found.items() if decided is not None} == {0, 2, 3}
 
 

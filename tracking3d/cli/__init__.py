@@ -83,7 +83,10 @@ def main() -> None:
 
 
 _ARENAS, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1  # M_ARENA_MAX and others in glibc's malloc.h
-_HEAPS, _LARGE = 2, 32 << 20  # and bytes; 4 MB save 40 MB more, and a third of the shape's time goes to the kernel
+_HEAPS, _LARGE = (
+    2,
+    32 << 20,
+)  # and bytes; 4 MB save 40 MB more, and a third of the shape's time goes to the kernel
 
 
 def _share_heaps() -> None:

@@ -101,10 +101,8 @@ class GlobalAdjustment:
         if len(self._views) < _LEAST_VIEWS or not has_texture(self._strengths):
             self._views = {}
             return
-        R = np.stack([self._views[index].T_cam_obj[:3, :3] for index in sorted(self._views)])
-        turned = np.degrees(Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).magnitude().sum())
-        views = int(np.clip(turned / _DEGREES_A_VIEW, *_USUAL_VIEWS))
-        scene = self._refine(max(views, self._frames // _FRAMES_A_VIEW))
+        R_cam_obj = np.stack([self._views[index].T_cam_obj[:3, :3] for index in sorted(self._views)])
+        scene = self._refine(max(views_needed(R_cam_obj), self._frames // _FRAMES_A_VIEW))
         if not is_supported(scene) and len(self._bundled) < len(self._views):
             scene = self._refine(len(self._views))  # nearer to one another, views share more landmarks
         self._views = {}
@@ -231,6 +229,12 @@ class GlobalAdjustment:
         assert self._scene is not None
         T = T_cam_obj if self._scene.reversal is None else self._scene.reversal.poses(T_cam_obj)
         return _through_lens(T, self._scene.focal_factor)
+
+
+def views_needed(R_cam_obj: NDArray[np.float64]) -> int:
+    """How many views of an object that turns as ``(N, 3, 3)`` in order of time are to be bundled."""
+    steps = Rotation.from_matrix(R_cam_obj[1:] @ R_cam_obj[:-1].transpose(0, 2, 1)).magnitude()
+    return round(np.clip(np.degrees(steps.sum()) / _DEGREES_A_VIEW, *_USUAL_VIEWS))
 
 
 def _through_lens(T_cam_obj: _Pose, focal_factor: float) -> _Pose:

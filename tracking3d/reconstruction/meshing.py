@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -158,7 +159,7 @@ class Grid:
         x, y, z = np.ceil((high - low) * self.spacing / spacing).astype(int) + 1
         return Grid(self.origin + self.spacing * low, spacing, (int(x), int(y), int(z)))
 
-    @property
+    @cached_property
     def points(self) -> FloatArray:
         """``(X * Y * Z, 3)`` centres; z runs fastest."""
         axes = [self.origin[axis] + self.spacing * np.arange(count) for axis, count in enumerate(self.shape)]

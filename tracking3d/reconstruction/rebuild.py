@@ -25,8 +25,8 @@ from tracking3d.reconstruction.views import keep_best_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.redrawing import redraw_contact_sheet
 from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.redrawing import redraw_contact_sheet
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import load_own_model, read_own_records

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.features.networks.catalogue import known_networks
+from tracking3d.features.networks.catalogue import description_names, known_networks
 from tracking3d.trackers.onnx.description import (
+    PACKAGE,
     PromptableNetwork,
     SaliencyNetwork,
-    builtin_segmenter_descriptions,
     load_segmenter_description,
 )
 
@@ -23,7 +23,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_kinds_that_come_along():
-    kinds = {name: type(load_segmenter_description(name)) for name in builtin_segmenter_descriptions()}
+    kinds = {name: type(load_segmenter_description(name)) for name in description_names(PACKAGE)}
     assert kinds == {
         "u2netp": SaliencyNetwork,
         "isnet": SaliencyNetwork,
@@ -34,7 +34,7 @@ def test_the_kinds_that_come_along():
     }
 
 
-@pytest.mark.parametrize("name", builtin_segmenter_descriptions())
+@pytest.mark.parametrize("name", description_names(PACKAGE))
 def test_what_comes_along_names_its_origin_and_networks_that_are_known(name):
     description = load_segmenter_description(name)
     assert description.title and description.link.startswith("https://")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -243,15 +243,6 @@ def _least_iou(scene: Drawn) -> float:
     return min(
         np.count_nonzero(scene.mask & other) / np.count_nonzero(scene.mask | other) for other in others
     )
-
-
-def segment_all(
-    hindsight: VideoSegmenter, frames: Iterable[ObjectView]
-) -> Iterator[tuple[int, SegmentedMask | None]]:
-    """Every frame of a video whose frames were all seen once, in their order."""
-    for frame in frames:
-        yield from hindsight.decide(frame)
-    yield from hindsight.rest()
 
 
 _ON, _OFF = 1.0, (3.0, 9.0)

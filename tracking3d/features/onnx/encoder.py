@@ -13,7 +13,7 @@ from torch.nn import functional
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.features.networks.catalogue import description_names, read_description
+from tracking3d.features.networks.catalogue import read_description
 from tracking3d.features.networks.session import Network, TensorInfo
 from tracking3d.features.networks.store import find_network
 
@@ -270,8 +270,3 @@ def load_encoder_description(name: str | Path) -> EncoderDescription:
         return EncoderDescription.model_validate(keys)
     except ValidationError as error:
         raise InputError(f"{file}: {describe_validation_error(error, EncoderDescription, 'key')}") from error
-
-
-def builtin_encoder_descriptions() -> list[str]:
-    """Names of the descriptions that come with the package."""
-    return description_names(PACKAGE)

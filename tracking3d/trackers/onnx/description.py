@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
-from tracking3d.features.networks.catalogue import description_names, read_description
+from tracking3d.features.networks.catalogue import read_description
 
 PACKAGE = "tracking3d.trackers.onnx"
 """The package whose folder ``descriptions`` holds the built-in descriptions."""
@@ -135,8 +135,3 @@ def load_segmenter_description(segmenter: str | Path) -> Description:
         return model.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{file}: {describe_validation_error(error, model, 'key')}") from error
-
-
-def builtin_segmenter_descriptions() -> list[str]:
-    """Names of the descriptions that come with the package."""
-    return description_names(PACKAGE)

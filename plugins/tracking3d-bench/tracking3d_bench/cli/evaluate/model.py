@@ -92,7 +92,7 @@ def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> d
     if clip is None:
         return asdict(score_held_out_frames(run, source, largest))
     found = asdict(_against_truth(run, clip))
-    with suppress(NothingHeldOutError):  # of a plain object no frame may be reliable, and the true shape is known all the same
+    with suppress(NothingHeldOutError):  # a plain object may have no reliable frame, and has a true shape
         found |= asdict(score_held_out_frames(run, source, largest))
     return found
 
