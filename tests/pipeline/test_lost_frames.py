@@ -167,8 +167,9 @@ def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
 @pytest.mark.parametrize(
     ("explained", "shown", "left", "goes_on"),
     [
-        (0, 10, 5, True),  # there is no map yet
-        (0, 10, 0, False),
+        (0, 5, 5, True),  # there is no map yet
+        (0, 5, 0, False),
+        (0, 6, 5, False),  # a quarter in vain
         (10, 15, 5, True),
         (2, 15, 5, False),  # with the other five it would not be enough
         (6, 10, 0, True),  # the first start explains five of these ten

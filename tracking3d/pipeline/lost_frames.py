@@ -156,6 +156,9 @@ def start_from_photos(
 
 _SAMPLED = 2  # every n-th frame is looked at for a start
 _MAX_UNEXPLAINED = 0.25  # share of the frames without a reliable pose up to which the first start stays
+_MOST_IN_VAIN = (
+    0.25  # share of the frames in which a start may explain none, as that of a plain object does (chosen)
+)
 _MIN_GAIN = 1.1  # times as many frames as the first start's must be explained
 
 
@@ -211,6 +214,8 @@ def try_second_start(
 def may_win(now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int) -> bool:
     """Whether a second start goes on, by the confidence in each frame now and with the first start, by index."""
     explained = _explained(now)
+    if not explained and len(now) > _MOST_IN_VAIN * frames:
+        return False
     if explained and explained + frames - len(now) <= _MIN_GAIN * _explained(before):
         return False
     shared = _explained({index: before.get(index, 0.0) for index in now})

@@ -8,6 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from online_runs import estimate_of, frame, solver, true_mask, turning_clip
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.features.klt import grey
@@ -32,6 +33,8 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     match_photos,
     neighbouring_pairs,
 )
+from tracking3d.estimation.solver import PhotoSet
+from tracking3d.frames import Frame
 from tracking3d.points.bundle_adjustment.adjustment import Tracks
 from tracking3d.testing.synthesis import convex_clips
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -128,6 +131,20 @@ def test_a_photo_that_shows_too_little_is_named_with_its_neighbours():
     assert start.reason.endswith("take one every 20 degrees or less")
     assert "photo 4 shares too few points with photos 3 and 5" in start.reason
     assert start.reason.startswith(f"8 photos, {len(start.structure.photos)} joined; ")
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_photos_of_a_plain_object_are_not_blamed_for_their_steps(plain):
+    flat = np.full_like(turning_clip().images[0], 120)
+    photos = {n: Frame(n, flat) if plain else frame(4 * n) for n in range(4)}
+    photo_set = PhotoSet(
+        tuple(photos), lambda indices: ((photos[n], estimate_of(true_mask(4 * n))) for n in indices)
+    )
+    state, _ = solver().init(photos[0], estimate_of(true_mask(0)))
+    state, found = solver().start_from_photos(state, photo_set)
+    assert ("hardly any texture" in found.reason) is plain
+    if plain:
+        assert not found.estimates and state.waiting_reason == found.reason
 
 
 def test_photos_too_far_apart_are_not_joined_and_no_motion_is_asked_for():

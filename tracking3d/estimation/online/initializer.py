@@ -17,7 +17,13 @@ from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.observation import Observer
-from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.features.klt import (
+    FollowedPoints,
+    follow,
+    grey,
+    has_texture,
+    texture_strength,
+)
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     restart_without_points,
@@ -77,6 +83,7 @@ from tracking3d.rendering import TexelMap
 from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.runtime.stage_times import in_stage
 
+_PLAIN = "the object has hardly any texture: no points join its photos"
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
@@ -211,7 +218,7 @@ class Initializer:
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        found, waiting = list[Photo](), list[Pending]()
+        found, waiting, strengths = list[Photo](), list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):
             frame, binary = mask.on(frame), mask.found
             if binary is None:
@@ -224,11 +231,13 @@ class Initializer:
             view = view_frame(self.observer, begun, frame, binary, pose, FollowedPoints.none())
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
             found.append(Photo.of(frame.index, grey(frame.image), binary))
+            strengths.append(texture_strength(grey(frame.image), binary))
         start = start_of_photos(found, camera)
         if begun is None or start.structure is None:
+            reason = start.reason if has_texture(strengths) or not found else _PLAIN
             if isinstance(state, Initializing):
-                state = replace(state, waiting_reason=start.reason)
-            return state, PhotoEstimates((), start.reason)
+                state = replace(state, waiting_reason=reason)
+            return state, PhotoEstimates((), reason)
         weights = FitWeights(smoothness=self.options.smoothness)
         views = [view for view, _ in waiting]
         made, shown = initial_map_of_photos(begun.object_map, start, found, views, camera, weights)
