@@ -48,10 +48,8 @@ class SiftDetector:
         found, descriptor = sift.detectAndCompute(image, mask.view(np.uint8))
         if not len(found):
             return Keypoints.none()
-        place = np.array([point.pt for point in found])
-        return Keypoints(
-            place, np.asarray(descriptor, dtype=np.float32)
-        )  # pixels are rounded once, by `detect`
+        place = np.array([point.pt for point in found])  # `detect` rounds pixels, once
+        return Keypoints(place, np.asarray(descriptor, dtype=np.float32))
 
 
 SIFT = SiftDetector()
@@ -109,13 +107,9 @@ def _turned(
     turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -degrees, 1.0)
     size = np.ceil(np.abs(turn[:, :2]) @ [width, height] - 1e-6).astype(int)
     turn[:, 2] += (size - [width, height]) / 2
-    turned = cv2.warpAffine(crop, turn, size.tolist(), borderMode=cv2.BORDER_REPLICATE)
-    mask = cv2.warpAffine(inside, turn, size.tolist(), flags=cv2.INTER_NEAREST)
-    return (
-        np.asarray(turned, dtype=np.uint8),
-        np.asarray(mask, dtype=np.uint8),
-        cv2.invertAffineTransform(turn),
-    )
+    turned = cv2.warpAffine(crop, turn, size.tolist(), borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
+    mask = cv2.warpAffine(inside, turn, size.tolist(), flags=cv2.INTER_NEAREST).astype(np.uint8)
+    return turned, mask, cv2.invertAffineTransform(turn)
 
 
 def detect_turned(
