@@ -28,7 +28,7 @@ EXACT = {
     "tracking3d.modules": """LaplacianLoss MeshRenderer OutlineLoss Silhouette SilhouetteLoss TextureLoss
         TexturedMesh RenderedViews camera_from_pinhole pinhole_of_camera pose_from_se3 quaternion_from_kornia
         quaternion_of_pose se3_from_matrix se3_of_pose""",
-    "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
+    "tracking3d.plugins": """FEATURES KEYPOINTS PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
         load_plugin plugin_label""",
     "tracking3d.testing": "check_encoder check_tracker",
     "tracking3d.rendering": """BackProjection BackendName Contour MatchedPoints NormalEquations PoseTarget PoseTerms
@@ -53,7 +53,7 @@ AT_LEAST = {
     "tracking3d.export.exporter": "Exporter",
     "tracking3d.export.options": "ExportOptions",
     "tracking3d.export.supervision_detections": "detections",
-    "tracking3d.features.protocol": "FeatureEncoder",
+    "tracking3d.features.protocol": "FeatureEncoder KeypointDetector Keypoints",
     "tracking3d.frames": "Box Frame Image MaskEstimate Prompt SkippedFrame",
     "tracking3d.geometry.camera": "Camera Window",
     "tracking3d.geometry.prototypes": "sphere",

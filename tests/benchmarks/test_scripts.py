@@ -24,7 +24,17 @@ from split import split
 from split_benefit import SplitMeasurement, looped
 
 FOLDER = Path(__file__).resolve().parents[2] / "plugins/tracking3d-bench/benchmarks"
-SCRIPTS = ("batch", "cost", "first_answers", "render", "same_answers", "schedule", "soak", "split")
+SCRIPTS = (
+    "batch",
+    "cost",
+    "first_answers",
+    "keypoint_matches",
+    "render",
+    "same_answers",
+    "schedule",
+    "soak",
+    "split",
+)
 
 
 def options_of(name: str) -> set[str]:

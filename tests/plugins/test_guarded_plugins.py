@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
 from tracking3d.errors import InputError, PluginError
+from tracking3d.features.protocol import Keypoints
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure, feature_fault, mask_fault
+from tracking3d.plugins.guard import (
+    GuardedDetector,
+    GuardedEncoder,
+    GuardedTracker,
+    PluginFailure,
+    feature_fault,
+    mask_fault,
+)
 
 FRAME = Frame(3, np.zeros((4, 6, 3), np.uint8))
 PROMPT = Prompt((1.0, 1.0, 2.0, 2.0))
@@ -127,3 +137,25 @@ def test_attributes_that_are_no_positive_numbers_are_refused(name, value):
     setattr(encoder, name, value)
     with pytest.raises(PluginError, match=f"mine is broken: its {name} is"):
         GuardedEncoder(encoder, "mine")
+
+
+@pytest.mark.parametrize(
+    ("found", "fault"),
+    [
+        (None, "None instead of Keypoints"),
+        (Keypoints(np.zeros((3, 2)), np.zeros((2, 8))), r"pixels have shape \(3, 2\)"),
+        (Keypoints(np.full((3, 2), np.nan), np.zeros((3, 8))), "not finite"),
+        (Keypoints(np.full((3, 2), 99.0), np.zeros((3, 8))), "in the picture"),
+    ],
+)
+def test_keypoints_that_violate_the_protocol_are_told(found, fault):
+    detector = SimpleNamespace(rotation_invariant=True, detect=lambda *_: found)
+    with pytest.raises(PluginFailure, match=fault):
+        GuardedDetector(detector, "it").detect(np.zeros((40, 60), np.uint8), np.ones((40, 60), bool), 9, 1.0)
+
+
+def test_keypoints_that_keep_to_the_protocol_are_passed_on():
+    found = Keypoints(np.array([[59.4, 39.4]]), np.ones((1, 8)))
+    guarded = GuardedDetector(SimpleNamespace(rotation_invariant=False, detect=lambda *_: found), "it")
+    assert guarded.detect(np.zeros((40, 60), np.uint8), np.ones((40, 60), bool), 9, 1.0) is found
+    assert guarded.rotation_invariant is False

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.plugins import FEATURES, TRACKERS, VARIABLE, list_plugins
+from tracking3d.plugins import FEATURES, KEYPOINTS, TRACKERS, VARIABLE, list_plugins
 from tracking3d.plugins.template import write_plugin
 
 ROOT = Path(__file__).resolve().parents[2]
-KINDS = pytest.mark.parametrize("kind", ["tracker", "features"])
+KINDS = pytest.mark.parametrize("kind", ["tracker", "features", "keypoints"])
 
 
 def python(*arguments: object, cwd: Path, path: Path) -> str:
@@ -48,17 +48,21 @@ def test_a_new_package_has_everything_and_nothing_unfilled(tmp_path, kind):
         if name.endswith(".py"):
             ast.parse(text)
     project = tomllib.loads(files["pyproject.toml"])["project"]
-    group, name = {"tracker": (TRACKERS, "MyOwnTracker"), "features": (FEATURES, "MyOwnEncoder")}[kind]
+    group, name = {
+        "tracker": (TRACKERS, "MyOwnTracker"),
+        "features": (FEATURES, "MyOwnEncoder"),
+        "keypoints": (KEYPOINTS, "MyOwnDetector"),
+    }[kind]
     assert project["entry-points"] == {group: {"my-own": f"{module}:{name}"}}
     assert "## Licence" in files["README.md"]
 
 
 @pytest.mark.slow
 def test_new_packages_pass_their_own_tests(tmp_path):
-    folders = [write_plugin(f"my-{kind}", kind, tmp_path) for kind in ("tracker", "features")]
+    folders = [write_plugin(f"my-{kind}", kind, tmp_path) for kind in ("tracker", "features", "keypoints")]
     path = Path(os.pathsep.join(map(str, folders)))
     result = python("-W", "error", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path, path=path)
-    assert "4 passed" in result
+    assert "6 passed" in result
 
 
 @KINDS

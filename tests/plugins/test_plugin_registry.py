@@ -14,6 +14,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.errors import PluginError
 from tracking3d.plugins import (
     FEATURES,
+    KEYPOINTS,
     TRACKERS,
     VARIABLE,
     PluginInfo,
@@ -121,7 +122,7 @@ def found(name: str) -> PluginInfo:
 
 def test_built_in_plugins_come_through_entry_points():
     infos = {(info.group, info.name): info for info in list_plugins()}
-    for key in [(TRACKERS, "csrt"), (TRACKERS, "precomputed"), (FEATURES, "rgb")]:
+    for key in [(TRACKERS, "csrt"), (TRACKERS, "precomputed"), (FEATURES, "rgb"), (KEYPOINTS, "sift")]:
         assert infos[key].package == "tracking3d"
         assert infos[key].status == "ok", infos[key].reason
         assert infos[key].options["type"] == "object"

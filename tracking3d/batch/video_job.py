@@ -87,7 +87,7 @@ def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetw
     named = {
         value
         for job in jobs
-        for plugin in (job.config.tracker, job.config.features)
+        for plugin in (job.config.tracker, job.config.features, job.config.keypoints)
         for value in plugin.model_dump().values()
         if isinstance(value, str) and value in known
     }

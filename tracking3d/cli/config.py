@@ -28,11 +28,11 @@ def show(
 
     from tracking3d.config.loading import layers_in_words
     from tracking3d.config.models import AUTO
-    from tracking3d.plugins import FEATURES, TRACKERS, check_options
+    from tracking3d.plugins import FEATURES, KEYPOINTS, TRACKERS, check_options
 
     settings = configure(config, preset, overrides, quality)
     shown = settings.model_dump(mode="json")
-    for section, group in (("tracker", TRACKERS), ("features", FEATURES)):
+    for section, group in (("tracker", TRACKERS), ("features", FEATURES), ("keypoints", KEYPOINTS)):
         choice = getattr(settings, section)
         if section == "tracker" and choice.name == AUTO:
             continue  # the video decides which one

@@ -36,13 +36,14 @@ def _with_command(args: list[str]) -> list[str]:
 
 app = typer.Typer(
     cls=_Plugins,
-    help="List the installed mask trackers, feature encoders and commands, or create a new plug-in.",
+    help="List the installed plug-ins and commands, or create a new plug-in.",
 )
 
 
 class _Kind(StrEnum):
     TRACKER = "tracker"
     FEATURES = "features"
+    KEYPOINTS = "keypoints"
 
 
 @app.command(name=DEFAULT)
@@ -52,7 +53,7 @@ def plugins(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """List the installed trackers, encoders and commands, and say what is wrong with those that cannot run."""
+    """List the installed plug-ins and commands, and say what is wrong with those that cannot run."""
     import json
     from dataclasses import asdict
 
@@ -84,7 +85,9 @@ def new(
         str,
         typer.Argument(metavar="NAME", help="Name of the plug-in, as --tracker or --features will take it."),
     ],
-    kind: Annotated[_Kind, typer.Option(help="Kind of plug-in: mask tracker or feature encoder.")],
+    kind: Annotated[
+        _Kind, typer.Option(help="What it is: mask tracker, feature encoder or keypoint detector.")
+    ],
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder in which the package's folder is created.")
     ] = Path(),

@@ -505,6 +505,7 @@ class PipelineConfig(Section):
 
     tracker: PluginChoice = PluginChoice(name=AUTO)
     features: PluginChoice = PluginChoice(name="rgb")
+    keypoints: PluginChoice = PluginChoice(name="sift")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
     crop: CropConfig = CropConfig()

@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
+from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Camera, Window, pixel_distance
@@ -270,6 +271,7 @@ class Observer:
     config: PipelineConfig  # the pipeline's configuration
     camera: Camera  # the camera of the full frame, as it was known before the first frame
     encoder: FeatureEncoder  # the feature encoder
+    detector: Detector = SIFT  # what finds keypoints
 
     @property
     def device(self) -> torch.device:

@@ -1,4 +1,4 @@
-"""The components of a session: solvers by name, the feature encoder, the device; and the times of its estimates."""
+"""The components of a session: solver, feature encoder, keypoint detector, device; and the times of its estimates."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from typing import Any, cast
 
 import torch
 
-from tracking3d.config.models import PipelineConfig, RuntimeConfig
+from tracking3d.config.models import PipelineConfig, PluginChoice, RuntimeConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.features.sift import SIFT
 from tracking3d.estimation.online.known_object import KnownObject, KnownObjectSolver
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import Solver
-from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.features.protocol import FeatureEncoder, KeypointDetector
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
-from tracking3d.plugins import FEATURES, build_plugin, plugin_label
-from tracking3d.plugins.guard import GuardedEncoder
+from tracking3d.plugins import FEATURES, KEYPOINTS, build_plugin, plugin_label
+from tracking3d.plugins.guard import GuardedDetector, GuardedEncoder
 from tracking3d.rendering.backend import choose_backend, threads_kept, why_no_numba
 from tracking3d.runtime.isolation import preserve_process
 from tracking3d.runtime.stage_times import StageTimes, Stopwatch
@@ -32,7 +33,11 @@ SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any
 
 
 def build_solver(
-    config: PipelineConfig, camera: Camera, encoder: FeatureEncoder, known: KnownObject | None
+    config: PipelineConfig,
+    camera: Camera,
+    encoder: FeatureEncoder,
+    detector: KeypointDetector,
+    known: KnownObject | None,
 ) -> Solver[Any]:
     """The solver that a configuration names, for the object that is known, if there is one.
 
@@ -40,10 +45,13 @@ def build_solver(
         config: The pipeline.
         camera: The camera of the full frame.
         encoder: The feature encoder.
+        detector: What finds keypoints.
         known: See `tracking3d.pipeline.known_object.load_known_object`.
     """
     if known is not None:
-        return KnownObjectSolver(config, camera, encoder, known)
+        return KnownObjectSolver(config, camera, encoder, known, detector)
+    if config.solver.name == "online":
+        return OnlineSolver(config, camera, encoder, detector)
     return SOLVERS[config.solver.name](config, camera, encoder)
 
 
@@ -59,6 +67,19 @@ def build_encoder(config: PipelineConfig) -> FeatureEncoder:
     label = plugin_label(FEATURES, config.features.name)
     with threads_kept(), preserve_process(torch.device("cpu")):
         return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
+
+
+def build_detector(config: PipelineConfig) -> KeypointDetector:
+    """The keypoint detector that a configuration names, under guard.
+
+    Raises:
+        PluginError: If it is unknown or broken.
+    """
+    if config.keypoints == PluginChoice(name="sift"):
+        return SIFT  # nothing needs to be looked up, which reads the metadata of all packages
+    label = plugin_label(KEYPOINTS, config.keypoints.name)
+    with threads_kept(), preserve_process(torch.device("cpu")):
+        return cast(KeypointDetector, GuardedDetector(build_plugin(KEYPOINTS, config.keypoints), label))
 
 
 def check_device(name: str) -> None:

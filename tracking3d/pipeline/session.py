@@ -30,6 +30,7 @@ from tracking3d.geometry.lens import Lens
 from tracking3d.pipeline.components import (
     SOLVERS,
     add_times,
+    build_detector,
     build_encoder,
     build_solver,
     check_backward_tracking,
@@ -96,6 +97,7 @@ class Session(SessionRefinement):
             if config.tracker.name != AUTO:
                 self._tracker = PromptedTracker(config.tracker, prompt)
             self._encoder = build_encoder(config) if encoder is None else encoder
+            self._detector = build_detector(config)
         self._solver: Solver[Any] | None = None
         self._state: Any = None
         self._camera: Camera | None = None
@@ -182,7 +184,7 @@ class Session(SessionRefinement):
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, FrameOrder(first.index), first.index
         self._undistortion = Undistortion(self._camera.lens)
-        solver = build_solver(self.config, self._camera, self._encoder, self._known)
+        solver = build_solver(self.config, self._camera, self._encoder, self._detector, self._known)
         return solver.for_live_source() if self._live and isinstance(solver, RefiningSolver) else solver
 
     @property

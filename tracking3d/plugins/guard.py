@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.errors import PluginError, Tracking3dError
-from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.features.protocol import FeatureEncoder, KeypointDetector, Keypoints
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import describe_exception
 from tracking3d.runtime.stage_times import in_stage
@@ -187,6 +187,38 @@ class GuardedEncoder:
         if fault := feature_fault(features, images, self._encoder):
             raise PluginFailure(self._label, fault)
         return features.detach()
+
+
+class GuardedDetector:
+    """A guarded keypoint detector; wraps a `tracking3d.features.protocol.KeypointDetector` and implements it."""
+
+    def __init__(self, detector: KeypointDetector, label: str) -> None:
+        self._detector, self._label = detector, label
+        self.rotation_invariant = bool(detector.rotation_invariant)
+
+    def detect(
+        self, image: NDArray[np.uint8], mask: NDArray[np.bool_], most: int, contrast: float
+    ) -> Keypoints:
+        """As the detector; raises `PluginFailure` if that fails, or its result violates the protocol."""
+        with _blame_plugin(self._label):
+            found = self._detector.detect(image, mask, most, contrast)
+        if fault := keypoint_fault(found, image.shape):
+            raise PluginFailure(self._label, fault)
+        return found
+
+
+def keypoint_fault(found: Any, size: tuple[int, ...]) -> str:
+    """Why these are not keypoints of a picture of ``size`` (H, W); empty if they are."""
+    if not isinstance(found, Keypoints):
+        return f"it returned {_kind(found)} instead of Keypoints"
+    pixel, descriptor = np.asarray(found.pixel), np.asarray(found.descriptor)
+    if pixel.shape != (len(pixel), 2) or descriptor.ndim != 2 or len(descriptor) != len(pixel):
+        return f"its pixels have shape {pixel.shape} and its descriptors {descriptor.shape}, not (M, 2) and (M, D)"
+    # Peaks between pixels may lie up to one beyond the border.
+    inside = ((pixel >= -1) & (pixel <= size[::-1])).all()  # false for NaN too
+    return (
+        "" if inside and np.isfinite(descriptor).all() else "its keypoints are not finite and in the picture"
+    )
 
 
 def mask_fault(answer: Any, size: tuple[int, int]) -> str:

@@ -23,13 +23,20 @@ TRACKERS = "tracking3d.trackers"
 FEATURES = "tracking3d.features"
 """Entry-point group of the feature encoders."""
 
+KEYPOINTS = "tracking3d.keypoints"
+"""Entry-point group of the keypoint detectors."""
+
 VARIABLE = "TRACKING3D_PLUGINS"
 """Environment variable that registers plug-ins for development."""
 
-KIND = {TRACKERS: "mask tracker", FEATURES: "feature encoder"}
+KIND = {TRACKERS: "mask tracker", FEATURES: "feature encoder", KEYPOINTS: "keypoint detector"}
 """Word for a plug-in of each group."""
 
-_METHODS = {TRACKERS: ("from_options", "init", "step"), FEATURES: ("from_options", "encode")}
+_METHODS = {
+    TRACKERS: ("from_options", "init", "step"),
+    FEATURES: ("from_options", "encode"),
+    KEYPOINTS: ("from_options", "detect"),
+}
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.plugins.registration import (
     FEATURES,
+    KEYPOINTS,
     KIND,
     TRACKERS,
     Registered,
@@ -21,7 +22,11 @@ from tracking3d.plugins.registration import (
     import_plugin,
 )
 
-_ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
+_ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    TRACKERS: (),
+    FEATURES: ("channels", "stride", "tau"),
+    KEYPOINTS: ("rotation_invariant",),
+}
 """Attributes of an instance besides its methods; an encoder may know its channels only once it is built."""
 
 
@@ -81,7 +86,7 @@ def load_plugin(group: str, name: str) -> type[Any]:
     """The class of a plug-in.
 
     Args:
-        group: ``TRACKERS`` or ``FEATURES``.
+        group: ``TRACKERS``, ``FEATURES`` or ``KEYPOINTS``.
         name: The plug-in's name.
 
     Raises:
@@ -126,7 +131,7 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
     """Build the chosen plug-in from its options.
 
     Returns:
-        A mask tracker or a feature encoder.
+        A mask tracker, a feature encoder or a keypoint detector.
 
     Raises:
         PluginError: As `check_options`; or the plug-in fails while it is built.
@@ -202,6 +207,7 @@ _ADVICE: dict[str, dict[str, str]] = {
         ),
         **dict.fromkeys(("none", "color", "colour", "pixels", "image"), "did you mean 'rgb'?"),
     },
+    KEYPOINTS: dict.fromkeys(("edgepoint", "edgepoint2"), "did you mean 'network'?"),
 }
 """By group, and by name in small letters without hyphens and versions."""
 

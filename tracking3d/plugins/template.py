@@ -9,11 +9,11 @@ from string import Template
 from typing import Literal
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.plugins.registration import FEATURES, KIND, TRACKERS, find_plugins
+from tracking3d.plugins.registration import FEATURES, KEYPOINTS, KIND, TRACKERS, find_plugins
 
-Kind = Literal["tracker", "features"]
-_GROUPS: dict[str, str] = {"tracker": TRACKERS, "features": FEATURES}
-_SUFFIXES = {"tracker": "Tracker", "features": "Encoder"}
+Kind = Literal["tracker", "features", "keypoints"]
+_GROUPS: dict[str, str] = {"tracker": TRACKERS, "features": FEATURES, "keypoints": KEYPOINTS}
+_SUFFIXES = {"tracker": "Tracker", "features": "Encoder", "keypoints": "Detector"}
 
 
 def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
@@ -52,7 +52,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
         "class_name": "".join(word.capitalize() for word in name.split("-")) + _SUFFIXES[kind],
         "group": group,
         "kind": KIND[group],
-        "option": kind,
+        "option": f"set {kind}={name}" if kind == "keypoints" else f"{kind} {name}",
     }
     files = {
         "pyproject.toml": "pyproject.toml.txt",

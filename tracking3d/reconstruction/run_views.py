@@ -70,7 +70,7 @@ def surface_keypoints(frame: ObjectView, model: ObjectModel) -> SurfaceKeypoints
     known = np.isfinite(there)
     camera_points = rays[known] * there[known, None]
     points = (camera_points - frame.T_cam_obj[:3, 3]) @ frame.T_cam_obj[:3, :3]
-    kept = Keypoints(found.pixel[known], found.descriptor[known])
+    kept = replace(found, pixel=found.pixel[known], descriptor=found.descriptor[known])
     return SurfaceKeypoints(kept, points, frame.P, frame.T_cam_obj, length)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from patterns import as_grey, disc, moved, shift, speckle, warped
 
-from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.estimation.online.features.sift import SIFT, Keypoints, detect, detect_turned, match
 
 
 def blobs(size: int, places: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -194,3 +194,69 @@ def test_where_there_is_nothing_to_compare_with_nothing_is_clear():
 def test_a_descriptor_without_entries_gives_no_nan():
     empty = described([[0, 0], [9, 9]], [[0.0], [0.0]])
     assert match(empty, empty).tolist() == []
+
+
+class BrightSpots:
+    """A detector that is not rotation invariant: spots, each described by the pixels around it."""
+
+    rotation_invariant = False
+
+    def detect(self, image, mask, most, contrast):
+        bright = (image == cv2.dilate(image, np.ones((9, 9)))) & (image > 170) & mask
+        bright[:8], bright[-8:], bright[:, :8], bright[:, -8:] = False, False, False, False
+        places = np.argwhere(bright)[:most]
+        around = [image[y - 8 : y + 9, x - 8 : x + 9].astype(np.float32).ravel() for y, x in places]
+        rows = np.array(around, np.float32).reshape(len(places), 17**2)
+        return Keypoints(
+            places[:, ::-1].astype(np.float32), rows - rows.mean(1, keepdims=True), "cosine", 0.95
+        )
+
+
+def about_z(degrees: float) -> np.ndarray:
+    angle = np.radians(degrees)
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("degrees", [0, 35, 90, 160, -100])
+def test_an_object_whose_pose_is_known_is_turned_upright(degrees):
+    """The picture is turned clockwise by what R says, so that descriptors are those of the first picture."""
+    image, mask = speckle(blur=3.0), disc((200, 240), (120, 100), 80)
+    motion = cv2.getRotationMatrix2D((120, 100), -degrees, 1.0)
+    first, second = (
+        detect_turned(seen, mask, BrightSpots(), about_z(angle))[0]
+        for seen, angle in ((image, 0), (warped(image, motion), degrees))
+    )
+    error = np.linalg.norm(errors(first, second, motion), axis=1)
+    assert len(error) > 0.4 * len(first) > 8
+    assert np.median(error) < 1
+    assert (error < 2).mean() > 0.9
+
+
+def test_where_nothing_tells_which_way_is_up_one_turn_of_four_matches():
+    image, mask = speckle(blur=3.0), disc((200, 240), (120, 100), 80)
+    motion = cv2.getRotationMatrix2D((120, 100), -80, 1.0)
+    first = detect(image, mask, detector=BrightSpots())
+    turns = detect_turned(warped(image, motion), mask, BrightSpots())
+    found = [len(match(first, turn)) for turn in turns]
+    assert len(turns) == 4 and found[3] == max(found) > 3 * found[0]
+    assert len(detect_turned(image, mask, SIFT)) == 1
+
+
+def test_a_detector_that_is_rotation_invariant_sees_the_picture_as_it_is():
+    image, mask = speckle(), disc((200, 240), (120, 100), 60)
+    plain, turned = detect(image, mask), detect_turned(image, mask, SIFT, about_z(50))[0]
+    assert np.array_equal(plain.pixel, turned.pixel)
+    assert np.array_equal(plain.descriptor, turned.descriptor)
+
+
+def test_cosines_are_of_whole_descriptors_whatever_their_length():
+    """Distance of unit vectors at an angle a is 2 sin(a / 2); 0.6 of the second best passes a ratio of 0.7."""
+
+    def at(degrees, length):
+        return [length * np.cos(np.radians(degrees)), length * np.sin(np.radians(degrees))]
+
+    for nearest, passes in ((30, True), (45, False)):
+        a = Keypoints(np.zeros((1, 2), np.float32), np.array([at(0, 3.0)], np.float32), "cosine", 0.7)
+        rows = np.array([at(nearest, 0.5), at(-55, 9.0)], np.float32)
+        b = Keypoints(np.array([[0, 0], [50, 0]], np.float32), rows, "cosine", 0.7)
+        assert len(match(a, b)) == passes

@@ -80,7 +80,7 @@ def configure(
     from tracking3d.config.loading import check_model, load_config, set_model
     from tracking3d.config.models import AUTO
     from tracking3d.pipeline.tracker_selection import check_tracker_options
-    from tracking3d.plugins import FEATURES, TRACKERS, check_options, plugin_label
+    from tracking3d.plugins import FEATURES, KEYPOINTS, TRACKERS, check_options, plugin_label
 
     config = load_config(file, preset, overrides or (), quality=quality, **_without_none(direct))
     if model is not None:
@@ -91,6 +91,8 @@ def configure(
     plugin_label(FEATURES, config.features.name)
     check_tracker_options(config)
     check_options(FEATURES, config.features)
+    if config.keypoints.name != "sift":
+        check_options(KEYPOINTS, config.keypoints)
     return config
 
 

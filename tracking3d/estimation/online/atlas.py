@@ -251,7 +251,7 @@ def _estimate_alignment(
     count = len(other.keyframes)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_COMPARED)).round().astype(int))
     compared = [other.keyframes[position] for position in chosen]
-    found = poses_from_matches(other, camera, view.keypoints, compared, pixel_scale(view))
+    found = poses_from_matches(other, camera, (view.keypoints,), compared, pixel_scale(view))
     if not found or len(found[0][1]) < ENOUGH_POINTS:
         return None
     pose, points = found[0]

@@ -24,6 +24,7 @@ from tracking3d.estimation.online.features.klt import (
     has_texture,
     texture_strength,
 )
+from tracking3d.estimation.online.features.sift import Detector
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     restart_without_points,
@@ -140,7 +141,7 @@ class Initializer:
         observation = replace(observation, features=space.project(observation.features, observation.image))
         window = cut_around_object(object_map, camera, frame.image, mask, pose)
         view = Keyframe(observation, mask, pose, FollowedPoints.none(), image=window)
-        object_map, view = insert_points(object_map, camera, view, image)
+        object_map, view = insert_points(object_map, camera, view, image, observer.detector)
         estimate = initial_estimate(frame, mask, pose, camera)
         last = pose, frame.index
         pending = ((view, estimate),)
@@ -161,7 +162,7 @@ class Initializer:
         followed = follow(state.grey, image, state.tracked_points)
         view = view_frame(self.observer, state, frame, mask, pose, followed)
         object_map, view = add_pending_frame(
-            state.object_map, tuple(v for v, _ in state.pending), view, image
+            state.object_map, tuple(v for v, _ in state.pending), view, image, self.observer.detector
         )
         estimate = initial_estimate(frame, mask, pose, state.camera)
         state = replace(
@@ -214,7 +215,7 @@ class Initializer:
 
     def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
-        camera = self.observer.camera
+        observer, camera = self.observer, self.observer.camera
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
@@ -227,10 +228,10 @@ class Initializer:
                 space = state.feature_space and replace(state.feature_space, contrast=0.0)
                 begun, _ = self.begin(frame, binary, camera, space)
             depth = first_translation(mask_ellipse(binary), camera)
-            pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=self.observer.device))
-            view = view_frame(self.observer, begun, frame, binary, pose, FollowedPoints.none())
+            pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=observer.device))
+            view = view_frame(observer, begun, frame, binary, pose, FollowedPoints.none())
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
-            found.append(Photo.of(frame.index, grey(frame.image), binary))
+            found.append(Photo.of(frame.index, grey(frame.image), binary, observer.detector))
             strengths.append(texture_strength(grey(frame.image), binary))
         start = start_of_photos(found, camera)
         if begun is None or start.structure is None:
@@ -245,7 +246,10 @@ class Initializer:
         joined, last = self._make_map(replace(begun, pending=pending), made)
         estimates = [*last.revised, replace(last, revised=())]
         rest = sorted(set(photos.indices) - set(chosen))
-        estimates += [_find_photo(joined, frame, mask) for frame, mask in (photos.read(rest) if rest else ())]
+        estimates += [
+            _find_photo(joined, frame, mask, observer.detector)
+            for frame, mask in (photos.read(rest) if rest else ())
+        ]
         return joined, PhotoEstimates(tuple(estimates), start.reason)
 
     def _try(self, state: Initializing) -> tuple[SolverState, FrameEstimate | None]:
@@ -449,13 +453,13 @@ def restart_if_misfit(state: Mapped, config: OnlineConfig) -> Mapped:
     )
 
 
-def _find_photo(state: Mapped, frame: Frame, mask: MaskEstimate) -> FrameEstimate:
+def _find_photo(state: Mapped, frame: Frame, mask: MaskEstimate, detector: Detector) -> FrameEstimate:
     """A photo that was not joined, by its matches with the nearest ones that were; lost if there are too few."""
     pose, binary = state.last_pose[0], mask.found
     nearest = sorted(state.object_map.keyframes, key=lambda view: abs(view.index - frame.index))
     matched = []
     if binary is not None:
-        [keypoints] = Photo.of(frame.index, grey(frame.image), binary).keypoints
+        keypoints = Photo.of(frame.index, grey(frame.image), binary, detector).keypoints
         scale = pixel_scale(nearest[0])
         matched = poses_from_matches(state.object_map, state.camera, keypoints, nearest[:4], scale)
     estimate = initial_estimate(frame, binary, matched[0][0] if matched else pose, state.camera)

@@ -21,7 +21,7 @@ from tracking3d.estimation.estimate import RELOCALIZED, FrameEstimate, ObjectMod
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.observation import Observation, crop, mask_box, observe
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
-from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.estimation.online.features.sift import SIFT, Detector, Keypoints, detect_turned, match
 from tracking3d.estimation.online.mapper import insert_frame
 from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
 from tracking3d.estimation.online.mapping.local_mapping import nearest_views, project_points, with_landmarks
@@ -40,7 +40,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.mesh import Mesh
-from tracking3d.geometry.pose import Pose, from_matrix, pose_from_arrays
+from tracking3d.geometry.pose import Pose, from_matrix, pose_arrays, pose_from_arrays
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.surface import sample_texture
@@ -116,11 +116,12 @@ class KnownObjectSolver(RefiningSolver[Mapped]):
     camera: Camera  # the camera of the full frame
     encoder: FeatureEncoder  # the feature encoder
     known_object: KnownObject  # the object
+    detector: Detector = SIFT  # what finds keypoints
 
     @cached_property
     def online(self) -> OnlineSolver:
         """The solver that tracks the object once it is detected."""
-        return OnlineSolver(self.config, self.camera, self.encoder)
+        return OnlineSolver(self.config, self.camera, self.encoder, self.detector)
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Mapped, FrameEstimate]:
         """Take the first frame.
@@ -137,7 +138,9 @@ class KnownObjectSolver(RefiningSolver[Mapped]):
         self._warn_of_lens()
         device = self.online.observer.device
         with in_stage("map"):
-            object_map, space = map_of_known_object(known_object, self.config, self.encoder, device)
+            object_map, space = map_of_known_object(
+                known_object, self.config, self.encoder, device, self.detector
+            )
         pose = Pose.identity(
             object_map.vertices.new_tensor([0.0, 0.0, 4 * self.camera.fy / self.camera.height])
         )
@@ -218,7 +221,7 @@ class KnownObjectSolver(RefiningSolver[Mapped]):
         if not found.doubtful or not self.known_object.has_colours:
             view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):
-                begun = insert_frame(begun, view, image, self.online.options)
+                begun = insert_frame(begun, view, image, self.online.options, self.detector)
             estimate = replace(estimate, keyframe=True)
         return learn_colours(begun, estimate, found), estimate
 
@@ -231,7 +234,9 @@ class KnownObjectSolver(RefiningSolver[Mapped]):
             if self.known_object.has_colours and not _is_sure(attempts):
                 attempts += [
                     self._attempt(state, frame, mask, RELOCALIZED, pose, points)
-                    for pose, points in by_keypoints(state.object_map, state.camera, image, region)
+                    for pose, points in by_keypoints(
+                        state.object_map, state.camera, image, region, self.detector
+                    )
                 ]
         if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):
             nothing, last = FollowedPoints.none(), state.last_pose[0]
@@ -319,7 +324,11 @@ _VERTICES = 600  # that tell the box of an outline
 
 
 def by_keypoints(
-    object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    object_map: ObjectMap,
+    camera: Camera,
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    detector: Detector = SIFT,
 ) -> list[tuple[Pose, FollowedPoints]]:
     """Poses from keypoint matches, and their inliers, most inliers first.
 
@@ -328,23 +337,28 @@ def by_keypoints(
         camera: The camera of the full frame.
         image: ``(H, W)`` grey.
         mask: ``(H, W)`` the region that is searched; None for the whole frame.
+        detector: What finds keypoints.
     """
     if mask is None:
         height = image.shape[0]
         everywhere = np.ones(image.shape, bool)
         found = [
-            (detect(image, everywhere, share * height, _MAX_KEYPOINTS), share * height / 200)
+            (keypoints, share * height / 200)
             for share in _LENGTHS
+            for keypoints in detect_turned(
+                image, everywhere, detector, length=share * height, most=_MAX_KEYPOINTS
+            )
         ]
     else:
         length = max(mask_box(mask)[2:])
         reach = 2 * max(round(0.05 * length), 1) + 1
         region = cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-        found = [(detect(image, region, length, _MAX_KEYPOINTS // 2), length / 200)]
+        turns = detect_turned(image, region, detector, length=length, most=_MAX_KEYPOINTS // 2)
+        found = [(keypoints, length / 200) for keypoints in turns]
     posed = []
     for keypoints, size in found:
         scale = max(1.0, size)
-        for pose, points in poses_from_matches(object_map, camera, keypoints, object_map.keyframes, scale)[
+        for pose, points in poses_from_matches(object_map, camera, (keypoints,), object_map.keyframes, scale)[
             :_MAX_POSES
         ]:
             posed.append(_combine_matches(object_map, camera, keypoints, pose, points, scale))
@@ -451,7 +465,11 @@ class RenderedSide:
 
 
 def map_of_known_object(
-    known: KnownObject, config: PipelineConfig, encoder: FeatureEncoder, device: torch.device
+    known: KnownObject,
+    config: PipelineConfig,
+    encoder: FeatureEncoder,
+    device: torch.device,
+    detector: Detector = SIFT,
 ) -> tuple[ObjectMap, FeatureSpace | None]:
     """The map and the feature space; None for the latter if no known colours determine it.
 
@@ -460,6 +478,7 @@ def map_of_known_object(
         config: The pipeline.
         encoder: The feature encoder.
         device: Where tensors live.
+        detector: What finds keypoints.
     """
     model, renderer = known.model, config.runtime.renderer
     shape = Shape.of(Mesh(known.vertices, model.faces, model.face_uvs), False, device)
@@ -487,7 +506,7 @@ def map_of_known_object(
         window = Window.around(mask_box(drawing.mask), config.crop.margin, config.crop.size)
         observation = observe(frame, drawing.mask, window, camera, encoder, device)
         view = Keyframe(observation, drawing.mask, pose, FollowedPoints.none())
-        learnt, view = _with_points(learnt, camera, view, drawing)
+        learnt, view = _with_points(learnt, camera, view, drawing, detector)
         learnt = replace(learnt, keyframes=(*learnt.keyframes, view))
         seen.append((view, drawing))
     channels = feature_channels(encoder, config.object.texture_channels)
@@ -577,12 +596,12 @@ def render_side(
 
 
 def _with_points(
-    learnt: ObjectMap, camera: Camera, view: Keyframe, drawing: RenderedSide
+    learnt: ObjectMap, camera: Camera, view: Keyframe, drawing: RenderedSide, detector: Detector
 ) -> tuple[ObjectMap, Keyframe]:
     """With landmarks at a drawn side's keypoints, exactly on the surface."""
     kernel = np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)
     inside = cv2.erode((drawing.known & drawing.mask).astype(np.uint8), kernel) > 0
-    keypoints = detect(grey(drawing.image), inside)
+    (keypoints,) = detect_turned(grey(drawing.image), inside, detector, pose_arrays(view.pose)[0])
     before = len(learnt.landmarks)
     learnt, view = with_landmarks(learnt, camera, view, keypoints, np.zeros((0, 2), np.float32))
     fresh = view.points.landmark >= before

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe, refine_local_map
@@ -51,7 +52,9 @@ _LANDMARK_PRIOR = (
 _SCALE = 1.0  # pixels
 
 
-def insert_frame(state: Mapped, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig) -> Mapped:
+def insert_frame(
+    state: Mapped, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig, detector: Detector = SIFT
+) -> Mapped:
     """The state with its last frame as a new keyframe, and the map refined.
 
     Args:
@@ -59,8 +62,9 @@ def insert_frame(state: Mapped, view: Keyframe, image: NDArray[np.uint8], config
         view: The frame with its pose and the points that agree with it.
         image: ``(H, W)`` grey.
         config: The solver's options.
+        detector: What finds keypoints.
     """
-    object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config)
+    object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config, detector)
     last = object_map.keyframes[-1].pose, view.index
     state = state.with_map(object_map, last_pose=last, tracked_points=followed)
     return refine_by_landmarks(fix_depth_reversal(state, config), config)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ELSEWHERE
 from tracking3d.estimation.observation import projected_box
 from tracking3d.estimation.online.features.klt import FollowedPoints
-from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.estimation.online.features.sift import SIFT, Detector, Keypoints, detect_turned, match
 from tracking3d.estimation.online.mapping.local_mapping import nearest_views
 from tracking3d.estimation.online.optimization.pose_refinement import refine_poses
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
@@ -30,7 +30,7 @@ from tracking3d.estimation.online.pose_tracking import (
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+from tracking3d.geometry.pose import Pose, from_matrix, pose_arrays, rotation_about
 from tracking3d.rendering import Surface
 
 ROTATION_SEARCH = "rotation_search"
@@ -80,7 +80,12 @@ Found = tuple[str, PoseFit, FollowedPoints]
 
 
 def relocalize(
-    state: Mapped, view: Keyframe, image: NDArray[np.uint8], best: Found, weights: PoseWeights
+    state: Mapped,
+    view: Keyframe,
+    image: NDArray[np.uint8],
+    best: Found,
+    weights: PoseWeights,
+    detector: Detector = SIFT,
 ) -> Found:
     """The best of the candidate so far and the costly hypotheses, by how they re-render the frame.
 
@@ -93,6 +98,7 @@ def relocalize(
         image: ``(H, W)`` grey.
         best: The best candidate so far.
         weights: The weights of the cost terms.
+        detector: What finds keypoints.
     """
     object_map, surface, camera, lost = state.object_map, state.surface, state.camera, state.lost
 
@@ -101,7 +107,8 @@ def relocalize(
         return name, fit, find_inliers(object_map, camera, fit.pose, asked, view)
 
     tried = [best]
-    for pose, points in match_keyframes(object_map, camera, replace(view, pose=best[1].pose), image, lost):
+    seen = replace(view, pose=best[1].pose)
+    for pose, points in match_keyframes(object_map, camera, seen, image, lost, detector):
         tried.append(fitted("keyframe", pose, points, points))
     if view.mask is not None and should_retry(state.lost_frames):
         centre = best[1].pose
@@ -120,7 +127,12 @@ _MAX_KEYFRAMES = 6  # most keyframes that a doubtful frame is matched with
 
 
 def match_keyframes(
-    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], anywhere: bool
+    object_map: ObjectMap,
+    camera: Camera,
+    view: Keyframe,
+    image: NDArray[np.uint8],
+    anywhere: bool,
+    detector: Detector = SIFT,
 ) -> list[tuple[Pose, FollowedPoints]]:
     """Poses from keypoints matched with keyframes, most inliers first.
 
@@ -130,40 +142,44 @@ def match_keyframes(
         view: The frame, with the best pose so far.
         image: ``(H, W)`` grey.
         anywhere: Whether to match more keyframes than those with the nearest viewing directions.
+        detector: What finds keypoints; if its object is anywhere, any side of it may be up.
     """
     region = np.ones(image.shape, bool) if view.mask is None else view.mask
     others = nearest_views(
         object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _MAX_KEYFRAMES
     )
-    keypoints = detect(image, region)
-    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _MAX_KEYFRAMES], pixel_scale(view))[
-        :3
-    ]
+    keypoints = detect_turned(image, region, detector, None if anywhere else pose_arrays(view.pose)[0])
+    others, scale = others[: 4 * _MAX_KEYFRAMES], pixel_scale(view)
+    return poses_from_matches(object_map, camera, keypoints, others, scale)[:3]
 
 
 def poses_from_matches(
-    object_map: ObjectMap, camera: Camera, keypoints: Keypoints, others: Sequence[Keyframe], scale: float
+    object_map: ObjectMap,
+    camera: Camera,
+    found: Sequence[Keypoints],
+    others: Sequence[Keyframe],
+    scale: float,
 ) -> list[tuple[Pose, FollowedPoints]]:
     """Poses from the matches with one keyframe each, most inliers first.
 
     Args:
         object_map: The map.
         camera: The camera of the full frame.
-        keypoints: The frame's keypoints.
+        found: The frame's keypoints, in one turn or in several.
         others: The keyframes.
         scale: See `pixel_scale`.
     """
-    found = []
-    for other in others:
+    posed = []
+    for keypoints, other in product(found, others):
         pairs = match(keypoints, other.keypoints)
         names = other.keypoint_landmark[pairs[:, 1]]
         sound = (names >= 0) & ~object_map.candidate[names]
         points = FollowedPoints(names[sound], keypoints.pixel[pairs[sound, 0]])
         pose = pose_of_points(object_map, camera, points, scale)
         if pose is not None:
-            found.append(pose)
-    found.sort(key=lambda one: -len(one[1]))
-    return found
+            posed.append(pose)
+    posed.sort(key=lambda one: -len(one[1]))
+    return posed
 
 
 # Relocalization of a lost object in the whole frame, by keypoints matched with the keyframes'.
@@ -176,7 +192,7 @@ _MIN_INLIERS = 10  # fewest inliers of one keyframe; matches with another object
 
 
 def relocalize_in_frame(
-    object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], last: Pose
+    object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], last: Pose, detector: Detector = SIFT
 ) -> tuple[Pose, FollowedPoints] | None:
     """The pose with most inliers among the frame's keypoints, and the inliers; None if there are too few.
 
@@ -185,12 +201,14 @@ def relocalize_in_frame(
         camera: The camera of the full frame.
         image: ``(H, W)`` grey.
         last: A pose from before the loss; the object is searched at about its size there.
+        detector: What finds keypoints.
     """
     box = projected_box(object_map.vertices, camera, last)
     if box is None or not object_map.keyframes:
         return None
     length = max(box[2], box[3])
-    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MAX_KEYPOINTS)
+    everywhere = np.ones(image.shape, bool)
+    keypoints = detect_turned(image, everywhere, detector, length=length, most=_MAX_KEYPOINTS)
     count = len(object_map.keyframes)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_KEYFRAMES_MATCHED)).round().astype(int))
     views = [object_map.keyframes[position] for position in chosen]

@@ -20,6 +20,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online import atlas, refiner
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initializer import Initializer
 from tracking3d.estimation.online.mapper import adopt_free_axis, insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
@@ -77,6 +78,7 @@ class OnlineSolver:
     config: PipelineConfig  # the pipeline's configuration
     camera: Camera  # the camera of the full frame
     encoder: FeatureEncoder  # the feature encoder
+    detector: Detector = SIFT  # what finds keypoints
     # whether the first map is computed in another thread; the result then depends on the machine
     in_background: bool = field(default=False, kw_only=True)
 
@@ -92,7 +94,7 @@ class OnlineSolver:
     @cached_property
     def observer(self) -> Observer:
         """How a frame becomes an observation."""
-        return Observer(self.config, self.camera, self.encoder)
+        return Observer(self.config, self.camera, self.encoder, self.detector)
 
     @cached_property
     def initializer(self) -> Initializer:
@@ -150,7 +152,7 @@ class OnlineSolver:
         if is_keyframe:
             with in_stage("map"):
                 view = replace(found.view, pose=pose, points=found.points)
-                updated = insert_frame(updated, view, image, options)
+                updated = insert_frame(updated, view, image, options, self.detector)
                 updated = atlas.merge_maps(updated, options, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)

@@ -77,7 +77,9 @@ class Tracker:
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
         if state.lost or needs_relocalization(fit, state.baseline, support):
-            won, fit, kept = relocalize(state, view, image, (won, fit, kept), self.weights)
+            won, fit, kept = relocalize(
+                state, view, image, (won, fit, kept), self.weights, self.observer.detector
+            )
             support = pose_evidence(object_map, camera, fit.pose, kept, view)
         astray = state.lost and not is_consistent_with_motion(state, fit.pose, frame.index)
         assessment = assess_pose(fit, state.baseline, support, won == ROTATION_SEARCH, astray)
@@ -110,7 +112,11 @@ class Tracker:
     ) -> PoseCandidate | None:
         """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
         where = relocalize_in_frame(
-            state.object_map, state.camera, image, (state.trajectory or (state.last_pose,))[-1][0]
+            state.object_map,
+            state.camera,
+            image,
+            (state.trajectory or (state.last_pose,))[-1][0],
+            self.observer.detector,
         )
         if where is None:
             return None

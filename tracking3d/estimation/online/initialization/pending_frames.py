@@ -22,7 +22,7 @@ from tracking3d.estimation.online.features.klt import (
     new_corners,
     texture_strength,
 )
-from tracking3d.estimation.online.features.sift import detect, match
+from tracking3d.estimation.online.features.sift import SIFT, Detector, detect, match
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     initialize_without_points,
@@ -72,7 +72,11 @@ _STILL = "nothing shows that the object turns: it is still, or turns about an ax
 
 
 def add_pending_frame(
-    object_map: ObjectMap, earlier: tuple[Keyframe, ...], view: Keyframe, image: NDArray[np.uint8]
+    object_map: ObjectMap,
+    earlier: tuple[Keyframe, ...],
+    view: Keyframe,
+    image: NDArray[np.uint8],
+    detector: Detector = SIFT,
 ) -> tuple[ObjectMap, Keyframe]:
     """A view into which points are tracked or matched; their depth is not known yet."""
     if _is_gone((*earlier, view)):
@@ -81,7 +85,7 @@ def add_pending_frame(
         view = replace(view, strength=texture_strength(image, inside))
     if inside is None or len(view.points) >= _MIN_POINT_SHARE * MOST_POINTS:
         return object_map, view
-    keypoints = detect(image, inside)
+    keypoints = detect(image, inside, detector=detector)
     label = np.full(len(keypoints), -1, np.int64)
     if len(view.points) and len(keypoints):
         gap = np.linalg.norm(keypoints.pixel[:, None] - view.points.pixel[None], axis=2)

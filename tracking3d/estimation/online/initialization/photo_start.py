@@ -568,7 +568,7 @@ def initial_map_of_photos(
 
 
 def _labelled_keypoints(photo: Photo, points: FollowedPoints) -> dict[str, Any]:
-    """The keypoints of a photo's first method as a keyframe has them, with the landmarks that they show."""
+    """The keypoints of a photo as it is, as a keyframe has them, with the landmarks that they show."""
     keypoints = photo.keypoints[0]
     if not (len(keypoints) and len(points)):
         return {"keypoints": Keypoints.none(), "keypoint_landmark": np.zeros(0, np.int64)}

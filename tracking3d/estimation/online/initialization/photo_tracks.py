@@ -6,21 +6,21 @@ rim, its outline, the plate. So only keypoints inside the masks count, and of th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.features.sift import Keypoints, detect, match
+from tracking3d.estimation.online.features.sift import SIFT, Detector, Keypoints, detect_turned, match
 from tracking3d.points.bundle_adjustment.adjustment import Tracks
 from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 
 # Of a photo, which has few neighbours (measured: 14 of 20 photos of the car are joined, with half as many keypoints 9).
-_KEYPOINTS, _SIZE, _CONTRAST, _RATIO = 1000, 600, 0.005, 0.85
+# Contrast and the ratio's distance from 1 are shares of the usual ones.
+_KEYPOINTS, _SIZE, _CONTRAST, _LOOSER = 1000, 600, 0.25, 0.75
 _STILL = 0.03  # share of the object's length; matches that move by less stand still (measured on the pot)
 _SILHOUETTE_SIZE = 160  # pixels along the longer side of a silhouette (chosen)
 _FEWEST_MATCHES, _LEAST_SHARE = 10, 0.15  # inliers of a pair, and their share of its matches (chosen)
@@ -31,22 +31,6 @@ _ITERATIONS, _CONFIDENCE = 1000, 0.999  # of the sampling of essential matrices
 Pair = tuple[int, int]
 Matches = Mapping[Pair, NDArray[np.int64]]
 """For each pair of photos ``(M, 2)`` places of matched keypoints in both."""
-
-
-@dataclass(frozen=True, eq=False)
-class KeypointMethod:
-    """A way to find and match keypoints; others than SIFT, such as networks, are added to `METHODS`."""
-
-    detect: Callable[[NDArray[np.uint8], NDArray[np.bool_]], Keypoints]  # grey image and mask, both (H, W)
-    match: Callable[[Keypoints, Keypoints], NDArray[np.int64]]  # gives (K, 2) indices
-
-
-METHODS: tuple[KeypointMethod, ...] = (
-    KeypointMethod(
-        partial(detect, most=_KEYPOINTS, size=_SIZE, contrast=_CONTRAST), partial(match, ratio=_RATIO)
-    ),
-)
-"""The matches of all methods are used together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +63,22 @@ class Photo:
     """What is known of one photo."""
 
     index: int  # in the source
-    keypoints: tuple[Keypoints, ...]  # of each of `METHODS`
+    keypoints: tuple[Keypoints, ...]  # of each turn, see `detect_turned`
     silhouette: PhotoSilhouette
     length: float  # pixels of the object's longer side
 
     @classmethod
-    def of(cls, index: int, grey: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Photo:
+    def of(
+        cls, index: int, grey: NDArray[np.uint8], mask: NDArray[np.bool_], detector: Detector = SIFT
+    ) -> Photo:
         """Find the keypoints of a grey photo ``(H, W)`` inside a mask ``(H, W)`` that is not empty."""
         *_, width, height = cv2.boundingRect(mask.astype(np.uint8))
-        found = tuple(method.detect(grey, mask) for method in METHODS)
+        found = detect_turned(grey, mask, detector, most=_KEYPOINTS, size=_SIZE, contrast=_CONTRAST)
         return cls(index, found, PhotoSilhouette.of(mask), float(max(width, height)))
 
     @property
     def pixels(self) -> FloatArray:
-        """``(K, 2)`` the keypoints of all methods, one after the other."""
+        """``(K, 2)`` the keypoints of all turns, one after the other."""
         return np.concatenate([one.pixel for one in self.keypoints]).astype(np.float64)
 
 
@@ -138,12 +124,12 @@ def match_photos(
 
 
 def _match_pair(a: Photo, b: Photo) -> NDArray[np.int64]:
-    """``(M, 2)`` places in `Photo.pixels`."""
-    matched, before = [], np.zeros(2, np.int64)
-    for method, here, there in zip(METHODS, a.keypoints, b.keypoints, strict=True):
-        matched.append(method.match(here, there) + before)
-        before += [len(here), len(there)]
-    return np.concatenate(matched)
+    """``(M, 2)`` places in `Photo.pixels`: the first photo as it is with the turn of the second that matches best."""
+    before = np.cumsum([0, *map(len, b.keypoints[:-1])])
+    turns = zip(b.keypoints, before, strict=True)
+    return max(
+        (match(a.keypoints[0], there, _LOOSER) + np.array([0, first]) for there, first in turns), key=len
+    )
 
 
 def join_tracks(photos: Sequence[Photo], matches: Matches) -> Tracks:

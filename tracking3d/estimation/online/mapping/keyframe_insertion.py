@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
-from tracking3d.estimation.online.features.sift import detect
+from tracking3d.estimation.online.features.sift import SIFT, Detector, detect_turned
 from tracking3d.estimation.online.mapping.local_mapping import (
     mask_weight,
     refine_map,
@@ -81,7 +81,7 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
 
 
 def insert_points(
-    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8]
+    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], detector: Detector = SIFT
 ) -> tuple[ObjectMap, Keyframe]:
     """Add landmarks at a view's keypoints and corners, and candidate landmarks around its mask.
 
@@ -90,11 +90,12 @@ def insert_points(
         camera: The camera of the full frame.
         view: The view with its pose and the points tracked into it.
         image: ``(H, W)`` grey.
+        detector: What finds keypoints.
     """
     if object_map.pointless:
         return object_map, view
     inside = view.mask if view.mask is not None else object_map.silhouette(view.pose, camera)
-    keypoints = detect(image, inside)
+    (keypoints,) = detect_turned(image, inside, detector, pose_arrays(view.pose)[0])
     taken = np.concatenate([view.points.pixel, keypoints.pixel])
     corners = new_corners(image, inside, taken, MOST_POINTS)
     object_map, view = with_landmarks(object_map, camera, view, keypoints, corners)
@@ -102,10 +103,15 @@ def insert_points(
 
 
 def insert_keyframe(
-    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
+    object_map: ObjectMap,
+    camera: Camera,
+    view: Keyframe,
+    image: NDArray[np.uint8],
+    config: OnlineConfig,
+    detector: Detector = SIFT,
 ) -> tuple[ObjectMap, FollowedPoints]:
     """The map with a view as a new keyframe, refined over the local window, and the points to track from it."""
-    object_map, view = insert_points(object_map, camera, view, image)
+    object_map, view = insert_points(object_map, camera, view, image, detector)
     drawn, filmed = (
         object_map.keyframes[: object_map.fixed_keyframes],
         (*object_map.keyframes[object_map.fixed_keyframes :], view),
