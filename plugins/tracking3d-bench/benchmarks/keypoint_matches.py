@@ -91,17 +91,22 @@ def _measure(
             turn = -np.degrees(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])) if upright else 0.0
             found = []
             for name, angle in ((a, 0.0), (b, turn)):
-                image = cv2.imread(str(clip / "frames" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
-                mask = cv2.imread(str(clip / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) > 127
+                image = _read_grey(clip / "frames" / f"{name}.jpg")
+                mask = _read_grey(clip / "masks" / f"{name}.png") > 127
                 begun = time.process_time()
                 found.append(detect(image, mask, detector=detector, turn=float(angle)))
                 seconds.append(time.process_time() - begun)
-            pairs_found = match(*found)
-            places = [one.pixel[pairs_found[:, side]] for side, one in enumerate(found)]
-            right.append(int((_off_line(*places, R, t, K) < _NEAR).sum()))
+            first, second = found
+            pairs_found = match(first, second)
+            x, y = first.pixel[pairs_found[:, 0]], second.pixel[pairs_found[:, 1]]
+            right.append(int((_off_line(x, y, R, t, K) < _NEAR).sum()))
             all_matches.append(len(pairs_found))
         means.append(f"{np.mean(right):.0f} of {np.mean(all_matches):.0f}" if pairs else "-")
     return f"{', '.join(means)}; {1000 * np.median(seconds):.1f} ms"
+
+
+def _read_grey(file: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def _off_line(
