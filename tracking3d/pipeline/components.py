@@ -50,9 +50,8 @@ def build_solver(
     """
     if known is not None:
         return KnownObjectSolver(config, camera, encoder, known, detector)
-    if config.solver.name == "online":
-        return OnlineSolver(config, camera, encoder, detector)
-    return SOLVERS[config.solver.name](config, camera, encoder)
+    solver = SOLVERS[config.solver.name](config, camera, encoder)
+    return replace(solver, detector=detector) if isinstance(solver, OnlineSolver) else solver
 
 
 _CPU = argument("runtime.device 'cpu'", "--device cpu")
