@@ -167,9 +167,8 @@ def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
 @pytest.mark.parametrize(
     ("explained", "shown", "left", "goes_on"),
     [
-        (0, 5, 5, True),  # there is no map yet
-        (0, 5, 0, False),
-        (0, 6, 5, False),  # a quarter in vain
+        (0, 10, 5, True),  # there is no map yet
+        (0, 10, 0, False),
         (10, 15, 5, True),
         (2, 15, 5, False),  # with the other five it would not be enough
         (6, 10, 0, True),  # the first start explains five of these ten
@@ -182,6 +181,11 @@ def test_a_second_start_ends_when_it_cannot_win_or_is_behind_at_the_end_of_the_b
     before = {n: float(n % 2) for n in range(20)}
     now = {n: float(n < explained) for n in range(shown)}
     assert may_win(now, before, 20, left) is goes_on
+
+
+@pytest.mark.parametrize(("shown", "frames", "goes_on"), [(60, 100, True), (61, 100, False), (75, 300, True)])
+def test_a_second_start_ends_when_it_has_explained_none_for_long(shown, frames, goes_on):
+    assert may_win(dict.fromkeys(range(shown), 0.3), {}, frames, 5) is goes_on
 
 
 @pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])

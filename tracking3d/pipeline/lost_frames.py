@@ -156,9 +156,9 @@ def start_from_photos(
 
 _SAMPLED = 2  # every n-th frame is looked at for a start
 _MAX_UNEXPLAINED = 0.25  # share of the frames without a reliable pose up to which the first start stays
-_MOST_IN_VAIN = (
-    0.25  # share of the frames in which a start may explain none, as that of a plain object does (chosen)
-)
+# Frames, and share of all, in which a start may explain none, as that of a plain object does (chosen: a first map takes
+# up to some 30 frames).
+_MOST_IN_VAIN = 60, 0.25
 _MIN_GAIN = 1.1  # times as many frames as the first start's must be explained
 
 
@@ -214,7 +214,7 @@ def try_second_start(
 def may_win(now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int) -> bool:
     """Whether a second start goes on, by the confidence in each frame now and with the first start, by index."""
     explained = _explained(now)
-    if not explained and len(now) > _MOST_IN_VAIN * frames:
+    if not explained and len(now) > max(_MOST_IN_VAIN[0], _MOST_IN_VAIN[1] * frames):
         return False
     if explained and explained + frames - len(now) <= _MIN_GAIN * _explained(before):
         return False
