@@ -98,6 +98,15 @@ def test_a_shape_that_hardly_any_frame_contradicts_stays(run, rebuilt, monkeypat
     assert (run / layout.ONLINE / layout.FEATURES).is_file()
 
 
+def test_a_mask_that_is_missing_in_the_run_before_costs_no_more_than_a_new_shape(run, rebuilt, monkeypatch):
+    def missing(*given: Path) -> bool:
+        raise FileNotFoundError("000003.png")
+
+    monkeypatch.setattr(rebuild, "keep_shape", missing)
+    correct_run(run, GIVEN)
+    assert rebuilt == [run / layout.CORRECTING]
+
+
 def test_until_the_shape_is_there_the_run_stays_and_the_same_call_makes_only_that(run, rebuilt, monkeypatch):
     before = (run / layout.FRAMES).read_bytes()
     with monkeypatch.context() as patch:

@@ -301,7 +301,7 @@ def _reconstruct_shape_again(corrected: Path, stage: Path, opened: OpenTracking)
     if not (is_finished(stage) and keeps_shape(corrected)):
         return
     kept = False
-    with suppress(InputError):  # the run that is corrected may be damaged
+    with suppress(InputError, OSError):  # the run that is corrected may be damaged, or lack masks
         kept = keep_shape(corrected, stage)
     if not kept:
         make_final_shape(stage, opened.config, opened.source, always=True)
