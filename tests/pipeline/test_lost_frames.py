@@ -190,7 +190,7 @@ def test_a_second_start_ends_when_it_has_explained_none_for_long(shown, frames, 
 
 def test_a_second_start_without_points_ends_with_its_map_if_the_first_had_none_either():
     assert not may_win(dict.fromkeys(range(9), 0.3), {}, 100, 50, without_points=True)
-    assert may_win({n: 0.9 for n in range(9)}, {}, 100, 50, without_points=True)
+    assert may_win(dict.fromkeys(range(9), 0.9), {}, 100, 50, without_points=True)
 
 
 @pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])

@@ -218,7 +218,11 @@ def try_second_start(
 
 
 def may_win(
-    now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int, without_points: bool = False
+    now: Mapping[int, float],
+    before: Mapping[int, float],
+    frames: int,
+    left: int,
+    without_points: bool = False,
 ) -> bool:
     """Whether a second start goes on, by the confidence in each frame now and with the first start, by index.
 
