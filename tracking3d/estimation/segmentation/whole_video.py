@@ -122,12 +122,12 @@ class VideoSegmenter:
         self._jobs: OrderedExecutor | None = None
 
     def see(self, frame: ObjectView) -> None:
-        """A frame for the first time, in the order of time; some of them are put together."""
+        """A frame for the first time, in the order of time, drawn already or not; some of them are put together."""
         self._seen.append(frame.index)
         wanted, may_keep = frame.index in self._wanted, frame.index in self._may_keep
         if not (wanted or may_keep) or not np.isfinite(frame.T_cam_obj).all():
             return
-        scene = self._scene(frame)
+        scene = frame if isinstance(frame, Drawn) else self._scene(frame)
         if scene is None or not scene.mask.any():
             return
         if may_keep and _least_iou(scene) > self._least_agreement:
