@@ -42,9 +42,9 @@ _LEAST_VIEWS = 6  # of a landmark that moves the surface
 _LEAST_SUPPORT = (
     60  # points in half of the views; with fewer, adjusted poses were wrong more often than right
 )
-_SETTLED = np.deg2rad(0.01)
-"""Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
-ten times as much is still to come."""
+_SETTLED, _TO_COME = np.deg2rad(0.01), np.deg2rad(0.05)
+"""Turn of a round that ends them, and what may still be to come if turns go on to shrink as they did. Of an object with
+faint texture a round leaves .8 to .9 of an error, so that five to ten times as much is; of others a few tenths."""
 _FEW_OUTLINES, _OUTLINE_SHARE = 30, 0.6
 """The surface is fitted to the outlines of so many views, or of that share of more."""
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
@@ -135,14 +135,15 @@ def refine_scene(
         rounds: How many times at most.
         free_focal: Whether to estimate the focal length too, because it is not given.
     """
-    done, last = 0, rounds
+    done, last, turned = 0, rounds, 0.0
     while done < last:
         report_progress("refining poses", done, last)
         done += 1
         before, scene = scene, _refine_once(scene, free_focal)
+        turned_before, turned = turned, _rotation_between(before, scene)
         if scene.reversal is not before.reversal:
-            last = done + rounds  # all of it is new
-        elif _rotation_between(before, scene) < _SETTLED:
+            last, turned = done + rounds, 0.0  # all of it is new
+        elif turned < _SETTLED or turned**2 < _TO_COME * (turned_before - turned):
             break
     report_progress("refining poses", done, done)
     return scene
