@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.rendering.backend import share_threads
 from tracking3d.results import layout
 from tracking3d.results.contact_sheet import look_of, render_view, side_shown
 from tracking3d.results.files import write_atomic, writing
@@ -66,15 +67,16 @@ def write_report(folder: Path, turntable: bool = True) -> Path:
         model, no_model = _model_of(run)
         front = _front(run, model)
         shown = model if turntable else None
-        movie = start_in_thread(partial(_write_movie, folder, shown, front), cv2.getNumThreads())
-        page = _page(run, model, front, no_model)
+        with share_threads(1):
+            movie = start_in_thread(partial(_write_movie, folder, shown, front), cv2.getNumThreads())
+            page = _page(run, model, front, no_model)
+            path = folder / layout.REPORT
+            write_atomic(path, page)
+            movie()
     except _DAMAGED as error:
         raise InputError(
             f"{folder / layout.RUN} is damaged ({type(error).__name__}: {error}); restore it."
         ) from error
-    path = folder / layout.REPORT
-    write_atomic(path, page)
-    movie()
     return path
 
 
