@@ -187,7 +187,9 @@ class RefinementSteps:
         self.retracked: dict[int, bytes] = {}
         self.look, self.masks = look, masks
         self._waiting: dict[int, Frame] = {}
-        self._drawn: Drawn | None = None  # the latest frame at its adjusted pose, if its silhouette was asked for
+        self._drawn: Drawn | None = (
+            None  # the latest frame at its adjusted pose, if its silhouette was asked for
+        )
 
     def collect(self, frame: Frame, mask: NDArray[np.bool_] | None = None) -> None:
         """Keep a frame for the adjustment, if it is one of those that are adjusted.

@@ -49,7 +49,7 @@ _TRUNCATION = 0.04  # of the object's diagonal
 _COARSE, _CELLS = (
     48,
     96,
-)  # along the longest side, of the surface that says where to look, and of the one that is made
+)  # along the longest side, of the surface that says where to look, and of the one made
 _BAND = 2.0  # coarse voxels around the coarse hull in which it is carved finely; elsewhere it is interpolated
 _REACH, _STEPS = 0.10, 10
 """How far around that surface depths are searched (of the diagonal), and in how many steps to either side."""
@@ -153,14 +153,9 @@ def _prior(
     truncation: float,
 ) -> FloatArray:
     """``(N,)`` signed distance from the shapes at hand, with that from the hull where views show that they lack it."""
-    return restore_uncovered(grid, hull, _start_distance(grid, starts, 1.2 * truncation), references)
-
-
-def _start_distance(
-    grid: Grid, starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], far: float
-) -> FloatArray:
-    """``(N,)`` signed distance from the shapes at hand; what one video has not shown is often missing from its own."""
-    return np.maximum.reduce([mesh_distance(grid, points, faces, far) for points, faces in starts])
+    # What one video has not shown is often missing from its own shape.
+    distances = [mesh_distance(grid, points, faces, 1.2 * truncation) for points, faces in starts]
+    return restore_uncovered(grid, hull, np.maximum.reduce(distances), references)
 
 
 def _guide(

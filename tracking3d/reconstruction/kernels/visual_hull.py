@@ -101,53 +101,43 @@ def surface_distance(corners: NDArray[Any], far: float, distance: NDArray[Any]) 
     distance[:] = np.sqrt(distance)
 
 
-@kernel("void(float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32, float32, int64, float32[:,:,::1])")
+@kernel(
+    "void(float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32, float32, int64, float32[:,:,::1])"
+)
 def vary_little(
-    mean: NDArray[Any],
-    weight: NDArray[Any],
-    most: NDArray[Any],
-    steep: float,
-    variation: float,
-    rounds: int,
+    mean: NDArray[Any], weight: NDArray[Any], most: NDArray[Any], steep: float, variation: float, rounds: int,
     distance: NDArray[Any],
-) -> None:
+) -> None:  # fmt: skip
     """Smooth ``distance`` (X, Y, Z): near ``mean`` by ``weight``, at most ``most``, with little total variation.
 
     Primal and dual steps by turns (Chambolle and Pock, 2011), with a Huber norm of the gradient that is quadratic below
     ``steep``.
     """
-    step = np.float32(0.28)  # the largest with which both converge in three dimensions is 1 / sqrt(12)
-    one, two = np.float32(1), np.float32(2)
+    step, one = np.float32(0.28), np.float32(1)  # both converge in three dimensions up to 1 / sqrt(12)
     X, Y, Z = distance.shape
-    ahead, dual = distance.copy(), np.zeros((3, X, Y, Z), np.float32)
-    row, shrink = np.empty(Z, np.float32), one / (one + step * steep / variation)
+    # One place more on every side, where the gradient is 0.
+    ahead, dual = np.zeros((X + 1, Y + 1, Z + 1), np.float32), np.zeros((3, X + 1, Y + 1, Z + 1), np.float32)
+    ahead[:X, :Y, :Z] = distance
+    shrink = one / (one + step * steep / variation)
     for _ in range(rounds):
         for i in range(X):
             for j in range(Y):
-                here, down, right = ahead[i, j], ahead[min(i + 1, X - 1), j], ahead[i, min(j + 1, Y - 1)]
-                x, y, z = dual[0, i, j], dual[1, i, j], dual[2, i, j]
+                here, down, right = ahead[i, j], ahead[i + 1, j], ahead[i, j + 1]
+                here[Z] = here[Z - 1]
+                x, y, z = dual[:, i + 1, j + 1]
+                by_x, by_y = np.float32(i + 1 < X) * step, np.float32(j + 1 < Y) * step
                 for k in range(Z):
-                    x[k] = (x[k] + step * (down[k] - here[k])) * shrink
-                    y[k] = (y[k] + step * (right[k] - here[k])) * shrink
-                for k in range(Z - 1):
-                    z[k] = (z[k] + step * (here[k + 1] - here[k])) * shrink
-                for k in range(Z):
-                    length = np.sqrt(x[k] * x[k] + y[k] * y[k] + z[k] * z[k])
-                    most_length = variation / max(length, variation)
-                    x[k] *= most_length
-                    y[k] *= most_length
-                    z[k] *= most_length
+                    at_x = (x[k + 1] + by_x * (down[k] - here[k])) * shrink
+                    at_y = (y[k + 1] + by_y * (right[k] - here[k])) * shrink
+                    at_z = (z[k + 1] + step * (here[k + 1] - here[k])) * shrink
+                    within = variation / max(np.sqrt(at_x * at_x + at_y * at_y + at_z * at_z), variation)
+                    x[k + 1], y[k + 1], z[k + 1] = at_x * within, at_y * within, at_z * within
         for i in range(X):
             for j in range(Y):
-                x, y, z = dual[0, i, j], dual[1, i, j], dual[2, i, j]
-                before, left = dual[0, max(i - 1, 0), j], dual[1, i, max(j - 1, 0)]
-                by_x, by_y = np.float32(i > 0), np.float32(j > 0)
-                for k in range(Z):
-                    row[k] = x[k] + y[k] + z[k] - by_x * before[k] - by_y * left[k]
-                for k in range(1, Z):
-                    row[k] -= z[k - 1]
+                x, y, z = dual[:, i + 1, j + 1]
+                before, left = dual[0, i, j + 1], dual[1, i + 1, j]
                 for k in range(Z):
                     last, held = distance[i, j, k], weight[i, j, k] * step
-                    found = (last + step * row[k] + held * mean[i, j, k]) / (one + held)
-                    found = min(found, most[i, j, k])
-                    distance[i, j, k], ahead[i, j, k] = found, two * found - last
+                    flow = x[k + 1] + y[k + 1] + z[k + 1] - before[k + 1] - left[k + 1] - z[k]
+                    found = min((last + step * flow + held * mean[i, j, k]) / (one + held), most[i, j, k])
+                    distance[i, j, k], ahead[i, j, k] = found, found + found - last
