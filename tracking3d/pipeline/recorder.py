@@ -36,6 +36,8 @@ from tracking3d.trackers.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
+_MAX_PROVISIONAL_SIZE = 512
+"""Most texels along a side of a texture that the one of the final shape replaces."""
 
 
 class ObjectRecorder:
@@ -295,11 +297,12 @@ class ObjectRecorder:
             self._work.wait()
             self._writer.begin_pass("model")
             surface, views = self.refinement.final_model()
-            # The texture of the final shape replaces this one at once. With `fine` and `extends` that may be refused.
+            # With `fine` and `extends` the reconstruction may be refused, and this texture stays.
             config = self._session.config
             replaced = config.object.shape == "auto" and config.object.extends is None
             replaced = replaced and is_reconstructed(self.refinement.records, config, source)
-            model = surface if replaced else close_unseen(bake_texture(surface, views, largest))
+            largest = min(largest, _MAX_PROVISIONAL_SIZE) if replaced else largest
+            model = close_unseen(bake_texture(surface, views, largest, details=not replaced))
             self._writer.end_refinement(self.refinement.passed_over)
             self._causal_model = None
         report_progress("writing the model")

@@ -44,13 +44,16 @@ Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
 """The texels ``(N,)`` that a view shows, their colours ``(3, N)`` in [0, 1], and how well each is seen ``(N,)``."""
 
 
-def bake_texture(model: ObjectModel, views: Sequence[ObjectView], largest: int = 2048) -> ObjectModel:
+def bake_texture(
+    model: ObjectModel, views: Sequence[ObjectView], largest: int = 2048, details: bool = True
+) -> ObjectModel:
     """The model with a texture at the views' resolution; the same if no view shows it.
 
     Args:
         model: With shape and texture coordinates; its features stay.
         views: Frames with poses of this model.
         largest: Most texels along a side.
+        details: Whether fine details are restored, see `restore_details`.
 
     Returns:
         The same surface. `ObjectModel.texture_weight` is 0 where no view shows it; there the texture continues its
@@ -61,10 +64,10 @@ def bake_texture(model: ObjectModel, views: Sequence[ObjectView], largest: int =
         return model
     with threads_kept():
         give_threads({"backend": "numba", "threads": 1})
-        return _paint_texture(model, views, texture_size(views, largest))
+        return _paint_texture(model, views, texture_size(views, largest), details)
 
 
-def _paint_texture(model: ObjectModel, views: Sequence[ObjectView], size: int) -> ObjectModel:
+def _paint_texture(model: ObjectModel, views: Sequence[ObjectView], size: int, details: bool) -> ObjectModel:
     report_progress("texture", 0, len(views))
     gains, coarse = _level_exposure(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
@@ -89,9 +92,10 @@ def _paint_texture(model: ObjectModel, views: Sequence[ObjectView], size: int) -
     on_surface[texel] = True
     texture = fill_holes(total.reshape(size, size, 3), on_surface.reshape(size, size))
     del total
-    planes = np.ascontiguousarray(texture.transpose(2, 0, 1))
-    del texture  # a large one takes 50 MB
-    texture = restore_details(model, planes, texels, views, gains).transpose(1, 2, 0)
+    if details:
+        planes = np.ascontiguousarray(texture.transpose(2, 0, 1))
+        del texture  # a large one takes 50 MB
+        texture = restore_details(model, planes, texels, views, gains).transpose(1, 2, 0)
     np.clip(np.round(np.multiply(texture, 255, out=texture), out=texture), 0, 255, out=texture)
     return replace(
         model,
