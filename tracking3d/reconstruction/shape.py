@@ -54,7 +54,7 @@ _BAND = 2.0  # coarse voxels around the coarse hull in which it is carved finely
 _REACH, _STEPS = 0.10, 10
 """How far around that surface depths are searched (of the diagonal), and in how many steps to either side."""
 _SMOOTH = (0.5, 0.8, 1.2)  # voxels; the first that gives a surface that is sound
-_GUIDE_FACES, _FACES, _MOST_FACES = 4000, 8000, 16_000
+_GUIDE_FACES, _FACES, _MOST_FACES = 4000, 6000, 16_000
 
 
 @dataclass(frozen=True, eq=False)
