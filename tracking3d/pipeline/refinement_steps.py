@@ -28,7 +28,12 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH
-from tracking3d.estimation.segmentation.whole_video import SegmentedMask, VideoSegmenter, draw_around_masks
+from tracking3d.estimation.segmentation.whole_video import (
+    LARGEST_AGAIN,
+    SegmentedMask,
+    VideoSegmenter,
+    draw_around_masks,
+)
 from tracking3d.estimation.solver import LEAST_FRAMES, RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
@@ -232,7 +237,7 @@ class RefinementSteps:
         assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
         if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
             return True
-        surface = self.look.vertices_of_landmarks, self.look.faces
+        surface = self.look.vertices_of_landmarks, self.look.faces, LARGEST_AGAIN
         self._drawn = drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
         agreement = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (agreement or 0.0) <= self._retracking.least_agreement

@@ -89,9 +89,9 @@ class GlobalAdjustment:
         """Keep a frame, if it is one of those that may be bundled and its object was found."""
         if self.wants(record.index) and record.status is not Status.LOST:
             crop = self._cut(record.T_cam_obj, image, mask)
-            if crop is not None:
+            if crop is not None and crop.mask is not None:
                 self._views[record.index] = crop, record.T_cam_obj
-                self._strengths.append(texture_strength(crop.image, crop.mask > _HALF))
+                self._strengths.append(texture_strength(crop.image, np.asarray(crop.mask > _HALF)))
 
     def settle(self) -> None:
         """Put poses, lens and surface right, as far as the frames say how.

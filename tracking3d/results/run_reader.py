@@ -170,7 +170,7 @@ class RunReader:
         return latest(read_records(self.folder / layout.FRAMES), self.refined)
 
     @cached_property
-    def causal_stages(self) -> StageTimes:
+    def causal_stages(self) -> StageTimes | None:
         """Times of the causal estimates, stage by stage; an InputError as of `frames`."""
         return stages_of(latest(read_records(self.folder / layout.FRAMES), refined=False))
 
