@@ -188,6 +188,11 @@ def test_a_second_start_ends_when_it_has_explained_none_for_long(shown, frames, 
     assert may_win(dict.fromkeys(range(shown), 0.3), {}, frames, 5) is goes_on
 
 
+def test_a_second_start_without_points_ends_with_its_map_if_the_first_had_none_either():
+    assert not may_win(dict.fromkeys(range(9), 0.3), {}, 100, 50, without_points=True)
+    assert may_win(dict.fromkeys(range(9), 0.9), {}, 100, 50, without_points=True)
+
+
 @pytest.mark.parametrize(("explained", "better"), [(11, False), (12, True), (3, False)])
 def test_a_second_start_must_explain_clearly_more(explained, better):
     assert SecondStart(4, explained, 10).is_better is better

@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import UNALIGNED_MAP, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.initialization.start_window import score_starts
 from tracking3d.estimation.solver import Gap, PhotoSet
@@ -190,7 +190,13 @@ def try_second_start(
         gaps: What the first start explains.
         tried: How many frames were tried already.
     """
-    frames = len(masks.estimates.causal)
+    frames, plain = len(masks.estimates.causal), session.lacks_points(ended=False)
+
+    def goes_on(found: Mapping[int, FrameEstimate]) -> bool:
+        now = {index: one.confidence for index, one in found.items()}
+        inliers = [one.diagnostics["inliers"] for one in found.values() if one.diagnostics]
+        return may_win(now, gaps.confidence, frames, tried.left, plain and bool(inliers) and not any(inliers))
+
     if not session.order_of_time or len(gaps.unexplained) <= _MAX_UNEXPLAINED * frames:
         return None
     start = find_start(source, masks)
@@ -202,7 +208,7 @@ def try_second_start(
         wanted = (frame for frame in frames_both_ways if isinstance(frame, Frame))
         known = (frame for frame in wanted if frame.index in masks.estimates.causal)
         shown = masks.with_masks(tried.count("second start", known))
-        attempt = session.attempt(shown, lambda now: may_win(now, gaps.confidence, frames, tried.left))
+        attempt = session.attempt(shown, goes_on)
     if attempt is None:
         return None
     second = SecondStart(start, _explained(attempt.confidence), _explained(gaps.confidence))
@@ -211,10 +217,20 @@ def try_second_start(
     return second
 
 
-def may_win(now: Mapping[int, float], before: Mapping[int, float], frames: int, left: int) -> bool:
-    """Whether a second start goes on, by the confidence in each frame now and with the first start, by index."""
+def may_win(
+    now: Mapping[int, float],
+    before: Mapping[int, float],
+    frames: int,
+    left: int,
+    without_points: bool = False,
+) -> bool:
+    """Whether a second start goes on, by the confidence in each frame now and with the first start, by index.
+
+    If neither start has a map with points, the second one may not begin with frames that it does not explain.
+    """
     explained = _explained(now)
-    if not explained and len(now) > max(_MOST_IN_VAIN[0], _MOST_IN_VAIN[1] * frames):
+    most_in_vain = 0 if without_points else max(_MOST_IN_VAIN[0], _MOST_IN_VAIN[1] * frames)
+    if not explained and len(now) > most_in_vain:
         return False
     if explained and explained + frames - len(now) <= _MIN_GAIN * _explained(before):
         return False

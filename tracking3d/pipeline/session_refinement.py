@@ -117,14 +117,14 @@ class SessionRefinement:
     def attempt(
         self,
         frames: Iterable[tuple[Frame, MaskEstimate]],
-        goes_on: Callable[[Mapping[int, float]], bool] = lambda confidence: True,
+        goes_on: Callable[[Mapping[int, FrameEstimate]], bool] = lambda found: True,
     ) -> Attempt | None:
         """Track the object once more from another frame, with given masks.
 
         Args:
             frames: Frames with their initial masks: from the start to the end of the video, then those before it
                 backwards.
-            goes_on: Whether the next frame is to be taken, by the confidence in each frame so far.
+            goes_on: Whether the next frame is to be taken, by the estimates so far, by index.
 
         Returns:
             What it comes to; None if the solver cannot, a plug-in fails, or it does not go on to the end.
@@ -148,7 +148,7 @@ class SessionRefinement:
                         estimate = order.index(estimate)
                     latest = max(latest, frame.index)
                     found |= {one.index: _without_masks(one) for one in (*estimate.revised, estimate)}
-                    if not goes_on({index: one.confidence for index, one in found.items()}):
+                    if not goes_on(found):
                         return None
         except PluginFailure:
             return None

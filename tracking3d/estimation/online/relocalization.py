@@ -144,6 +144,8 @@ def match_keyframes(
         anywhere: Whether to match more keyframes than those with the nearest viewing directions.
         detector: What finds keypoints; if its object is anywhere, any side of it may be up.
     """
+    if object_map.pointless:
+        return []
     region = np.ones(image.shape, bool) if view.mask is None else view.mask
     others = nearest_views(
         object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _MAX_KEYFRAMES
@@ -204,7 +206,7 @@ def relocalize_in_frame(
         detector: What finds keypoints.
     """
     box = projected_box(object_map.vertices, camera, last)
-    if box is None or not object_map.keyframes:
+    if box is None or object_map.pointless or not object_map.keyframes:
         return None
     length = max(box[2], box[3])
     everywhere = np.ones(image.shape, bool)
