@@ -210,9 +210,7 @@ def record_tracking(
 def _track_into(
     request: TrackRequest, folders: Sequence[Path], options: RecordOptions, listener: Listener
 ) -> tuple[FrameSource, PipelineConfig, list[bool]]:
-    """Write run folders but for their shapes, which take the memory that this needs: source, config, and which runs
-    were finished before.
-    """
+    """Write run folders but for shapes, which get its memory: source, config, and which runs were finished before."""
     with (
         open_tracking(request, folders[0] if options.resume else None) as opened,
         ExitStack() as writers,

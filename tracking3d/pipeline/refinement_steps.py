@@ -192,9 +192,7 @@ class RefinementSteps:
         self.retracked: dict[int, bytes] = {}
         self.look, self.masks = look, masks
         self._waiting: dict[int, Frame] = {}
-        self._drawn: Drawn | None = (
-            None  # the latest frame at its adjusted pose, if its silhouette was asked for
-        )
+        self._drawn: Drawn | None = None  # the latest frame as adjusted, if its silhouette was asked for
 
     def collect(self, frame: Frame, mask: NDArray[np.bool_] | None = None) -> None:
         """Keep a frame for the adjustment, if it is one of those that are adjusted.
@@ -260,11 +258,8 @@ class RefinementSteps:
     def collect_mask(self, frame: Frame) -> None:
         """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
-        drawn = self._drawn
-        if drawn is None or drawn.index != frame.index:
-            self.masks.see(self._segmentation_input(frame))
-        else:
-            self.masks.see(drawn)
+        drawn = None if self._drawn is None or self._drawn.index != frame.index else self._drawn
+        self.masks.see(drawn or self._segmentation_input(frame))
 
     def settle_masks(self) -> None:
         """All frames were collected: put together what their masks have in common."""

@@ -46,7 +46,6 @@ _LEAST_VIEWS = 4
 # Deviations by which the default lens is off where it is not taken, and degrees that views are then apart (chosen: the
 # photos of the car have 12 and 160; deviations of views from one side are too small).
 _EXCLUDED, _SIDES_APART = 4.0, 60.0
-_HALF = 127  # of a mask of 0 to 255
 _Pose = NDArray[np.float64]
 
 
@@ -91,7 +90,7 @@ class GlobalAdjustment:
             crop = self._cut(record.T_cam_obj, image, mask)
             if crop is not None and crop.mask is not None:
                 self._views[record.index] = crop, record.T_cam_obj
-                self._strengths.append(texture_strength(crop.image, np.asarray(crop.mask > _HALF)))
+                self._strengths.append(texture_strength(crop.image, np.asarray(crop.mask > 127)))
 
     def settle(self) -> None:
         """Put poses, lens and surface right, as far as the frames say how.
@@ -230,9 +229,8 @@ class GlobalAdjustment:
 
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> Drawn | None:
         crop = self._cut(T_cam_obj, image, mask)
-        if crop is None:
-            return None
-        return draw_into_window(crop, self.camera, T_cam_obj, self.vertices, self.faces)
+        surface = self.vertices, self.faces
+        return None if crop is None else draw_into_window(crop, self.camera, T_cam_obj, *surface)
 
     def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
         """A pose of before as it is after what was done to all: the way round of depth, and the lens."""

@@ -163,9 +163,9 @@ class Grid:
     def resample(self, values: FloatArray, other: Grid) -> FloatArray:
         """``(N,)`` values at this grid's centres, interpolated linearly at the centres of another grid."""
         first, step = (other.origin - self.origin) / self.spacing, other.spacing / self.spacing
-        volume = values.reshape(self.shape)
-        found = affine_transform(volume, [step] * 3, first, other.shape, order=1, mode="nearest")
-        return np.asarray(found, np.float32).ravel()
+        volume, steps = values.reshape(self.shape), [step] * 3
+        found = affine_transform(volume, steps, first, other.shape, np.float32, order=1, mode="nearest")
+        return np.asarray(found.ravel())
 
     @cached_property
     def points(self) -> FloatArray:

@@ -153,7 +153,6 @@ def _prior(
     truncation: float,
 ) -> FloatArray:
     """``(N,)`` signed distance from the shapes at hand, with that from the hull where views show that they lack it."""
-    # What one video has not shown is often missing from its own shape.
     distances = [mesh_distance(grid, points, faces, 1.2 * truncation) for points, faces in starts]
     return restore_uncovered(grid, hull, np.maximum.reduce(distances), references)
 
@@ -379,8 +378,8 @@ def fuse_depth(
 
     sum_of_weights = weight + np.float32(PRIOR)
     mean = (total / truncation + PRIOR * np.clip(prior / truncation, -1, 1)) / sum_of_weights
-    most = np.clip(hull / truncation, -1, 1)
-    given = [np.ascontiguousarray(part, np.float32).reshape(shape) for part in (mean, sum_of_weights, most)]
+    parts = mean, sum_of_weights, np.clip(hull / truncation, -1, 1)
+    given = [np.ascontiguousarray(part, np.float32).reshape(shape) for part in parts]
     distance = np.minimum(given[0], given[2])
     if variation:
         vary_little(*given, _STEEP, variation, _ROUNDS, distance)

@@ -110,8 +110,7 @@ def vary_little(
 ) -> None:  # fmt: skip
     """Smooth ``distance`` (X, Y, Z): near ``mean`` by ``weight``, at most ``most``, with little total variation.
 
-    Primal and dual steps by turns (Chambolle and Pock, 2011), with a Huber norm of the gradient that is quadratic below
-    ``steep``.
+    Primal and dual steps by turns (Chambolle and Pock, 2011); below ``steep`` the square of the gradient counts.
     """
     step, one = np.float32(0.28), np.float32(1)  # both converge in three dimensions up to 1 / sqrt(12)
     X, Y, Z = distance.shape
