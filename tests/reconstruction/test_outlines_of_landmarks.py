@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 
+from tracking3d.points import landmark_adjustment
 from tracking3d.points.landmark_adjustment import (
     LandmarkScene,
     fit_outlines,
@@ -76,3 +79,20 @@ def test_outlines_are_fitted_in_thirty_views_or_six_tenths_of_a_long_video(views
     if fitted > 1:
         assert (places[0], places[-1]) == (0, views - 1)
         assert np.ptp(np.diff(places)) <= 1
+
+
+@pytest.mark.parametrize(("left", "rounds"), [(0.85, 12), (0.3, 4)])
+def test_rounds_end_where_little_is_to_come(monkeypatch, left, rounds):
+    """Of 5 degrees, each round leaves a share."""
+    done = []
+
+    def turn(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
+        done.append(len(done))
+        return replace(scene)
+
+    monkeypatch.setattr(landmark_adjustment, "_refine_once", turn)
+    monkeypatch.setattr(
+        landmark_adjustment, "_rotation_between", lambda *scenes: np.radians(5 * left ** len(done))
+    )
+    refine_scene(LandmarkScene([], np.eye(3), np.eye(3, dtype=np.int64)), 12)
+    assert len(done) == rounds

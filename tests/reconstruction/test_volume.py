@@ -10,6 +10,7 @@ from rendered_views import CAMERA, pattern, pose, seen
 from twins import plane_sweep, visual_hull
 
 from tracking3d.geometry.prototypes import sphere
+from tracking3d.reconstruction.kernels.visual_hull import vary_little
 from tracking3d.reconstruction.meshing import Grid
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps, patch_scores
 from tracking3d.reconstruction.shape import (
@@ -198,6 +199,25 @@ def test_noise_and_holes_go_and_the_surface_stays():
     rough = fuse_depth(grid.shape, far, -far, noisy * weight, weight, truncation, variation=0)
     wrong, before = ((one > 0) != (ball > 0) for one in (made, rough))
     assert wrong.mean() < 0.5 * before.mean()
+
+
+def test_kernel_and_twin_of_the_total_variation_agree():
+    rng = np.random.default_rng(3)
+    mean, weight, most = rng.normal(0, 1, (3, 5, 7, 9)).astype(np.float32)
+    given = mean, np.abs(weight), most, 0.1, 0.5, 20, np.minimum(mean, most)
+    twin = visual_hull.vary_little(*given)
+    vary_little(*given)
+    np.testing.assert_allclose(given[-1], twin, atol=1e-5)
+
+
+def test_what_is_known_of_a_coarse_grid_is_known_of_a_fine_one():
+    coarse = Grid.around(np.array([[-1.0] * 3, [1.0, 0.5, 0.7]]), 12, 0.1)
+    fine = coarse.around_centres(coarse.points[:, 0] > 0, coarse.spacing / 3)
+    plane = np.array([0.3, -0.2, 0.5])
+    found = coarse.resample((coarse.points @ plane).astype(np.float32), fine)
+    within = ((fine.points >= coarse.points.min(0)) & (fine.points <= coarse.points.max(0))).all(1)
+    assert within.mean() > 0.5
+    np.testing.assert_allclose(found[within], (fine.points @ plane)[within], atol=1e-5)
 
 
 def test_a_map_of_every_other_pixel_is_known_everywhere(around):

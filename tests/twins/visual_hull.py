@@ -39,3 +39,31 @@ def robust_hull(
     rank = torch.minimum((share * seen).long() + least, seen - 1).clamp_min(0)
     hull = ordered.gather(0, rank[None])[0].clamp_max(far)
     return hull.float().numpy(), seen.float().numpy()
+
+
+def vary_little(
+    mean: FloatArray,
+    weight: FloatArray,
+    most: FloatArray,
+    steep: float,
+    variation: float,
+    rounds: int,
+    distance: FloatArray,
+) -> FloatArray:
+    """See `tracking3d.reconstruction.kernels.visual_hull.vary_little`; the result is returned."""
+    mean, weight, most, distance = (torch.from_numpy(part) for part in (mean, weight, most, distance))
+    step, shape = 0.28, distance.shape
+    ahead, dual = distance.clone(), torch.zeros(3, *shape)
+    for _ in range(rounds):
+        for axis in range(3):
+            dual[axis].narrow(axis, 0, shape[axis] - 1).add_(ahead.diff(dim=axis), alpha=step)
+        dual /= 1 + step * steep / variation
+        dual /= (dual.square().sum(0).sqrt() / variation).clamp_min(1)
+        last, distance = distance, distance.clone()
+        for axis in range(3):
+            flow = dual[axis].narrow(axis, 0, shape[axis] - 1)
+            distance.narrow(axis, 0, shape[axis] - 1).add_(flow, alpha=step)
+            distance.narrow(axis, 1, shape[axis] - 1).sub_(flow, alpha=step)
+        distance = torch.minimum((distance + step * weight * mean) / (1 + step * weight), most)
+        ahead = 2 * distance - last
+    return distance.numpy()

@@ -136,6 +136,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
     """Make the mesh of a run, and return what to print about it."""
     from tracking3d.cli.progress import plan_shape, plan_texture, show_progress
     from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
+    from tracking3d.rendering.backend import share_threads
     from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader
 
@@ -146,7 +147,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
         ]
     frames, outcome = len(RunReader(run).frames), []
     if model == "fine":
-        with show_progress(quiet, plan_shape(frames)):
+        with show_progress(quiet, plan_shape(frames)), share_threads(1):
             shaped = rebuild_shape(run, source, views, largest)
         note_in_run(run, {"shape": shaped.sentence})
         made, taken = shaped.model, shaped.views
@@ -154,7 +155,7 @@ def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: i
             f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence
         )
     else:
-        with show_progress(quiet, plan_texture(frames)):
+        with show_progress(quiet, plan_texture(frames)), share_threads(1):
             made, taken = retexture_run(run, source, views, largest)
     size = len(made.texture)
     return [*outcome, f"{run}: texture of {size} x {size} texels from {taken} frames"]
@@ -166,10 +167,12 @@ def _extend_mesh(
     """Make the mesh of a run with the frames of an earlier one, and return what to print about it."""
     from tracking3d.cli.progress import plan_shape, show_progress
     from tracking3d.reconstruction.extension import extend_run
+    from tracking3d.rendering.backend import share_threads
     from tracking3d.results.run_notes import note_in_run
     from tracking3d.results.run_reader import RunReader
 
-    with show_progress(quiet, plan_shape(len(RunReader(run).frames) + len(RunReader(earlier).frames))):
+    frames = len(RunReader(run).frames) + len(RunReader(earlier).frames)
+    with show_progress(quiet, plan_shape(frames)), share_threads(1):
         extended = extend_run(run, earlier, source, views, largest)
     note_in_run(run, {"shape": extended.sentence})
     made = extended.shaped.model

@@ -195,6 +195,22 @@ def record_tracking(
     request = replace(request, source=without_repeats(request.source, prompted))
     folders = object_folders(folder, len(prompts)) if prompts.as_lists else [folder]
     check_output_folder(folder, options.overwrite)
+    source, config, were_finished = _track_into(request, folders, options, listener)
+    for into, was_finished in zip(folders, were_finished, strict=True):
+        if options.first_pass_only:
+            continue
+        if was_finished:
+            complete_run(into, config, source)
+        elif "shape" not in RunReader(into).description:
+            make_final_shape(into, config, source)
+        apply_object_size(into, config.object)
+    return [RunReader(into) for into in folders]
+
+
+def _track_into(
+    request: TrackRequest, folders: Sequence[Path], options: RecordOptions, listener: Listener
+) -> tuple[FrameSource, PipelineConfig, list[bool]]:
+    """Write run folders but for shapes, which get its memory: source, config, and which runs were finished before."""
     with (
         open_tracking(request, folders[0] if options.resume else None) as opened,
         ExitStack() as writers,
@@ -213,15 +229,7 @@ def record_tracking(
                 for recording in active if options.first_pass_only else ():
                     with active.guard(recording):
                         recording.pause()
-    for into, recorded in zip(folders, recordings, strict=True):
-        if options.first_pass_only:
-            continue
-        if recorded is None:
-            complete_run(into, opened.config, opened.source)
-        elif "shape" not in RunReader(into).description:
-            make_final_shape(into, opened.config, opened.source)
-        apply_object_size(into, opened.config.object)
-    return [RunReader(into) for into in folders]
+        return opened.source, opened.config, [recorded is None for recorded in recordings]
 
 
 def begin_recording(

@@ -28,7 +28,12 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH
-from tracking3d.estimation.segmentation.whole_video import SegmentedMask, VideoSegmenter, draw_around_masks
+from tracking3d.estimation.segmentation.whole_video import (
+    LARGEST_AGAIN,
+    SegmentedMask,
+    VideoSegmenter,
+    draw_around_masks,
+)
 from tracking3d.estimation.solver import LEAST_FRAMES, RefinedStart
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
@@ -44,6 +49,7 @@ from tracking3d.results.refinement_writer import adjusted_record
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import load_own_model, read_own_records
 from tracking3d.runtime.stage_times import StageTimes
+from tracking3d.scene.surface import Drawn
 from tracking3d.scene.view import ObjectView
 
 Decision = tuple[Frame, SegmentedMask | None]
@@ -186,6 +192,7 @@ class RefinementSteps:
         self.retracked: dict[int, bytes] = {}
         self.look, self.masks = look, masks
         self._waiting: dict[int, Frame] = {}
+        self._drawn: Drawn | None = None  # the latest frame as adjusted, if its silhouette was asked for
 
     def collect(self, frame: Frame, mask: NDArray[np.bool_] | None = None) -> None:
         """Keep a frame for the adjustment, if it is one of those that are adjusted.
@@ -206,6 +213,7 @@ class RefinementSteps:
     def adjust(self, frame: Frame) -> FrameRecord:
         """The estimate of a frame with its adjusted pose; a causal one as it is."""
         record = self._estimates.estimate(frame.index)
+        self._drawn = None
         if not record.refined:
             return record
         T_cam_obj, support = self.look.pose(record, frame.image, self._visible(record))
@@ -215,6 +223,7 @@ class RefinementSteps:
                 again = self._retracking.take_alone(frame)
             self._retracking.pass_over(frame, record.T_cam_obj)
             if again is not None:
+                self._drawn = None
                 self.retracked[frame.index] = self._estimates.put_retracked(again, frame.name)
                 record = self._estimates.estimate(frame.index)
                 T_cam_obj, support = self.look.pose(record, frame.image, self._visible(record))
@@ -226,8 +235,8 @@ class RefinementSteps:
         assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
         if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
             return True
-        surface = self.look.vertices_of_landmarks, self.look.faces
-        drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
+        surface = self.look.vertices_of_landmarks, self.look.faces, LARGEST_AGAIN
+        self._drawn = drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
         agreement = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (agreement or 0.0) <= self._retracking.least_agreement
 
@@ -249,7 +258,8 @@ class RefinementSteps:
     def collect_mask(self, frame: Frame) -> None:
         """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
-        self.masks.see(self._segmentation_input(frame))
+        drawn = None if self._drawn is None or self._drawn.index != frame.index else self._drawn
+        self.masks.see(drawn or self._segmentation_input(frame))
 
     def settle_masks(self) -> None:
         """All frames were collected: put together what their masks have in common."""

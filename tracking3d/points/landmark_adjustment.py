@@ -42,9 +42,9 @@ _LEAST_VIEWS = 6  # of a landmark that moves the surface
 _LEAST_SUPPORT = (
     60  # points in half of the views; with fewer, adjusted poses were wrong more often than right
 )
-_SETTLED = np.deg2rad(0.01)
-"""Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
-ten times as much is still to come."""
+_SETTLED, _TO_COME = np.deg2rad(0.01), np.deg2rad(0.05)
+"""Turn of a round that ends them, and what may still be to come if turns go on to shrink as they did. Of an object with
+faint texture a round leaves .8 to .9 of an error, so that five to ten times as much is; of others a few tenths."""
 _FEW_OUTLINES, _OUTLINE_SHARE = 30, 0.6
 """The surface is fitted to the outlines of so many views, or of that share of more."""
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
@@ -135,14 +135,15 @@ def refine_scene(
         rounds: How many times at most.
         free_focal: Whether to estimate the focal length too, because it is not given.
     """
-    done, last = 0, rounds
+    done, last, turned = 0, rounds, 0.0
     while done < last:
         report_progress("refining poses", done, last)
         done += 1
         before, scene = scene, _refine_once(scene, free_focal)
+        turned_before, turned = turned, _rotation_between(before, scene)
         if scene.reversal is not before.reversal:
-            last = done + rounds  # all of it is new
-        elif _rotation_between(before, scene) < _SETTLED:
+            last, turned = done + rounds, 0.0  # all of it is new
+        elif turned < _SETTLED or turned**2 < _TO_COME * (turned_before - turned):
             break
     report_progress("refining poses", done, done)
     return scene
@@ -397,8 +398,8 @@ STILL = np.deg2rad(0.05)
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Drawn, float]:
-    """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
+def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Array, float]:
+    """The pose ``(4, 4)`` at which a view shows what other views show, and how much of that it shows there.
 
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
 
@@ -408,7 +409,7 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """
     share = 0.0
-    for _ in range(TURNS):
+    for turn in range(TURNS):
         others = [scene.views[index] for index in known]
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
@@ -417,7 +418,7 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
             if others[source] is not None
         ]
         if not found:
-            return view, share
+            break
         points, measured, deviation = (np.concatenate(part) for part in zip(*found, strict=True))
         placed = bundle(
             points,
@@ -428,11 +429,12 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
             _FIXED * scene.radius,
         )
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
-        before, view = view, redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
-        turned = view.T_cam_obj[:3, :3] @ before.T_cam_obj[:3, :3].T
-        if Rotation.from_matrix(turned).magnitude() < STILL:
-            break
-    return view, share
+        T_cam_obj = placed.T_cam_obj[0]
+        turned = T_cam_obj[:3, :3] @ view.T_cam_obj[:3, :3].T
+        if turn + 1 == TURNS or Rotation.from_matrix(turned).magnitude() < STILL:
+            return T_cam_obj, share
+        view = redraw_surface(view, scene.vertices, scene.faces, T_cam_obj)
+    return view.T_cam_obj, share
 
 
 def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int, index: int) -> tuple[Array, Array, Array]:

@@ -52,14 +52,16 @@ def fit_to_outlines(
     farthest = _FARTHEST * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     for _ in range(STEPS):
         normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
-        matrix, target, points = csr_matrix((len(vertices),) * 2), np.zeros(len(vertices)), 0
-        for view in views:
-            rows, residual = _equations(vertices, faces, normals, view)
-            weighted = rows.T @ diags(1 / (1 + (residual / SCALE) ** 2))
-            matrix, target = matrix + weighted @ rows, target - weighted @ residual
-            points += len(residual)
-        if not points:
+        equations = [_equations(vertices, faces, normals, view) for view in views]
+        if not equations:
             return vertices
+        change, ends, residual = (np.concatenate(part) for part in zip(*equations, strict=True))
+        if not len(residual):
+            return vertices
+        starts = np.arange(0, ends.size + 1, 2)
+        rows = csr_matrix((change.ravel(), ends.ravel(), starts), (len(residual), len(vertices)))
+        weighted = rows.T @ diags(1 / (1 + (residual / SCALE) ** 2))
+        matrix, target = weighted @ rows, -(weighted @ residual)
         # In pixels of a view: what a displacement by one pixel costs does not depend on the object's unit.
         unit = max(float(matrix.diagonal().max()), 1e-12)
         moved = spsolve((matrix / unit + hold * (np.mean(matrix.diagonal()) / unit)).tocsc(), target / unit)
@@ -74,8 +76,10 @@ def _equations(
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],
     view: ObjectView,
-) -> tuple[csr_matrix, NDArray[np.float64]]:
-    """How the distances of the contour's points change with displacements ``(N, V)``, and what they are ``(N,)``."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """How the distances of the contour's points change ``(N, 2)`` by displacements of which vertices ``(N, 2)``, and
+    what they are ``(N,)``.
+    """
     drawn = render(
         torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.zeros(len(faces), 3, 2),
         torch.zeros(1, 2, 2), *camera_tensors(view), view.window.shape,
@@ -95,9 +99,7 @@ def _equations(
     by_screen = (turned[..., :2] - points[:, None, :2] / z * turned[..., 2:]) / z
     by_screen = by_screen * np.diag(view.K)[:2] * share[..., None]
     change = (by_screen * slope[known].double().numpy()[:, None]).sum(2)
-    rows = np.repeat(np.arange(len(points)), 2)
-    shape = (len(points), len(vertices))
-    return coo_matrix((change.ravel(), (rows, ends.ravel())), shape).tocsr(), residual[known].double().numpy()
+    return change, ends, residual[known].double().numpy()
 
 
 def _laplacian(faces: NDArray[np.int64], vertices: int) -> csr_matrix:

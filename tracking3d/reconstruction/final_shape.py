@@ -10,6 +10,7 @@ import numpy as np
 from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
+from tracking3d.rendering.backend import share_threads
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_notes import note_in_run, timed_pass
 from tracking3d.results.run_reader import RunReader
@@ -63,7 +64,7 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
         OutputError: If something cannot be written.
     """
     if config.object.extends is not None:
-        with timed_pass(folder, "shape"):
+        with timed_pass(folder, "shape"), share_threads(1):
             sentence = _extend(folder, config, source)
         note_in_run(folder, {"shape": sentence})
         return sentence
@@ -72,7 +73,7 @@ def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource, 
     records = RunReader(folder).frames if config.object.shape == "auto" and not always else ()
     if not (always or is_reconstructed(records, config, source)):
         return ""
-    with timed_pass(folder, "shape"):
+    with timed_pass(folder, "shape"), share_threads(1):
         try:
             sentence = (
                 f"The shape stays, for {source.name} comes once only and all frames are needed a second time."

@@ -29,10 +29,10 @@ from tracking3d.points.landmark_adjustment import (
     refine_through,
     resect,
 )
-from tracking3d.points.view import LANDMARK_WINDOW, open_view
+from tracking3d.points.view import LANDMARK_WINDOW, cut_window, draw_into_window, open_view
 from tracking3d.results.records import FrameRecord
 from tracking3d.scene.surface import Drawn
-from tracking3d.scene.view import ObjectView
+from tracking3d.scene.view import FrameCrop, ObjectView
 
 ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
@@ -73,7 +73,7 @@ class GlobalAdjustment:
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
         self._wanted = {answered[index] for index in at}
-        self._views: dict[int, Drawn] = {}
+        self._views: dict[int, tuple[FrameCrop, _Pose]] = {}
         self._strengths: list[float] = []
         self._scene: LandmarkScene | None = None
         self._bundled: list[int] = []
@@ -87,10 +87,10 @@ class GlobalAdjustment:
     def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
         """Keep a frame, if it is one of those that may be bundled and its object was found."""
         if self.wants(record.index) and record.status is not Status.LOST:
-            view = self._view(record.T_cam_obj, image, mask)
-            if view is not None:
-                self._views[record.index] = view
-                self._strengths.append(texture_strength(grey(image), mask))
+            crop = self._cut(record.T_cam_obj, image, mask)
+            if crop is not None and crop.mask is not None:
+                self._views[record.index] = crop, record.T_cam_obj
+                self._strengths.append(texture_strength(crop.image, np.asarray(crop.mask > 127)))
 
     def settle(self) -> None:
         """Put poses, lens and surface right, as far as the frames say how.
@@ -101,7 +101,7 @@ class GlobalAdjustment:
         if len(self._views) < _LEAST_VIEWS or not has_texture(self._strengths):
             self._views = {}
             return
-        R_cam_obj = np.stack([self._views[index].T_cam_obj[:3, :3] for index in sorted(self._views)])
+        R_cam_obj = np.stack([self._views[index][1][:3, :3] for index in sorted(self._views)])
         scene = self._refine(max(views_needed(R_cam_obj), self._frames // _FRAMES_A_VIEW))
         if not is_supported(scene) and len(self._bundled) < len(self._views):
             scene = self._refine(len(self._views))  # nearer to one another, views share more landmarks
@@ -129,8 +129,11 @@ class GlobalAdjustment:
         there = sorted(self._views)
         at = np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).round().astype(int))
         self._bundled = [there[place] for place in at]
-        views: list[Drawn | None] = [self._views[index] for index in self._bundled]
-        self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
+        self._before = {index: self._views[index][1] for index in self._bundled}
+        views: list[Drawn | None] = [
+            draw_into_window(self._views[index][0], self.camera, T, self.vertices, self.faces)
+            for index, T in self._before.items()
+        ]
         scene = LandmarkScene(views, self.vertices, self.faces, may_reverse=True)
         rounds = int(np.clip(_DRAWN // len(views), *ROUNDS))
         refined = refine_through(scene, rounds, self.camera)
@@ -141,7 +144,7 @@ class GlobalAdjustment:
         turn = np.degrees(np.arccos(np.clip((np.einsum("aij,bij->ab", R, R).min() - 1) / 2, -1, 1)))
         if turn > _SIDES_APART and abs(math.log(factor / refined.focal_factor)) > _EXCLUDED * deviation:
             return refined
-        poses = [_through_lens(self._views[index].T_cam_obj, factor) for index in self._bundled]
+        poses = [_through_lens(T, factor) for T in self._before.values()]
         refined = refine_scene(scene.redrawn(self.vertices, dict(enumerate(poses)), factor), rounds)
         return replace(refined, focal_deviation=deviation)
 
@@ -174,10 +177,10 @@ class GlobalAdjustment:
         view = None if lost else self._view(predicted, image, mask)
         if view is None:
             return predicted, None
-        resected, share = resect(scene, view, around)
+        T_cam_obj, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
+        return T_cam_obj, LandmarkSupport(followed, round(share * followed))
 
     def deviation(self, record: FrameRecord, T_cam_obj: _Pose) -> float:
         """Degrees by which `pose` turned a frame against the other frames; infinite if it had no landmarks to do so.
@@ -220,9 +223,14 @@ class GlobalAdjustment:
         T[:3, 3] = (1 - share) * poses[0, :3, 3] + share * poses[1, :3, 3]
         return T
 
-    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> Drawn | None:
+    def _cut(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> FrameCrop | None:
         image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
-        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LANDMARK_WINDOW)
+        return cut_window(image, mask, self.camera, T_cam_obj, self.vertices, LANDMARK_WINDOW)
+
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> Drawn | None:
+        crop = self._cut(T_cam_obj, image, mask)
+        surface = self.vertices, self.faces
+        return None if crop is None else draw_into_window(crop, self.camera, T_cam_obj, *surface)
 
     def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
         """A pose of before as it is after what was done to all: the way round of depth, and the lens."""
@@ -326,9 +334,9 @@ class HeldAdjustment:
         scene = LandmarkScene(
             [self._views[index] for index in sources], self.vertices_of_landmarks, self.faces
         )
-        resected, share = resect(scene, view, range(len(sources)))
+        T_cam_obj, share = resect(scene, view, range(len(sources)))
         followed = max(self._shares[index].followed for index in sources)
-        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
+        return T_cam_obj, LandmarkSupport(followed, round(share * followed))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model as it is: its surface was refined before."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import affine_transform
 
 if TYPE_CHECKING:
     import trimesh
@@ -158,6 +159,13 @@ class Grid:
         low, high = (at.min(0) - 1, at.max(0) + 1) if len(at) else (0, np.array(self.shape) - 1)
         x, y, z = np.ceil((high - low) * self.spacing / spacing).astype(int) + 1
         return Grid(self.origin + self.spacing * low, spacing, (int(x), int(y), int(z)))
+
+    def resample(self, values: FloatArray, other: Grid) -> FloatArray:
+        """``(N,)`` values at this grid's centres, interpolated linearly at the centres of another grid."""
+        first, step = (other.origin - self.origin) / self.spacing, other.spacing / self.spacing
+        volume, steps = values.reshape(self.shape), [step] * 3
+        found = affine_transform(volume, steps, first, other.shape, np.float32, order=1, mode="nearest")
+        return np.asarray(found.ravel())
 
     @cached_property
     def points(self) -> FloatArray:

@@ -14,7 +14,6 @@ from functools import partial
 
 import cv2
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -50,11 +49,12 @@ _TRUNCATION = 0.04  # of the object's diagonal
 _COARSE, _CELLS = (
     48,
     96,
-)  # along the longest side, of the surface that says where to look, and of the one that is made
+)  # along the longest side, of the surface that says where to look, and of the one made
+_BAND = 2.0  # coarse voxels around the coarse hull in which it is carved finely; elsewhere it is interpolated
 _REACH, _STEPS = 0.10, 10
 """How far around that surface depths are searched (of the diagonal), and in how many steps to either side."""
 _SMOOTH = (0.5, 0.8, 1.2)  # voxels; the first that gives a surface that is sound
-_GUIDE_FACES, _FACES, _MOST_FACES = 4000, 8000, 16_000
+_GUIDE_FACES, _FACES, _MOST_FACES = 4000, 6000, 16_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,34 +129,32 @@ def _volume(
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
     coarse = Grid.around(vertices, _COARSE, _MARGIN)
-    hull, prior = _bounds(coarse, starts, views, references, truncation)
-    guide = _guide(coarse, hull, prior, *starts[0])
+    around, _ = carve_hull(coarse.points, views, 2 * truncation)
+    prior = _prior(coarse, around, starts, references, truncation)
+    guide = _guide(coarse, around, prior, *starts[0])
     maps = depth_maps(views, references, guide, _REACH * diagonal, _STEPS)
-    grid = coarse.around_centres(hull > -coarse.spacing, coarse.spacing * _COARSE / _CELLS)
-    hull, prior = _bounds(grid, starts, views, references, truncation)
-    total, weight = depth_evidence(grid.points, maps, truncation)
+    grid = coarse.around_centres(around > -coarse.spacing, coarse.spacing * _COARSE / _CELLS)
+    hull = coarse.resample(around, grid)
+    near = np.abs(hull) < _BAND * coarse.spacing
+    hull[near], _ = carve_hull(grid.points[near], views, 2 * truncation)
+    prior = _prior(grid, hull, starts, references, truncation)
+    total, weight = np.zeros_like(hull), np.zeros_like(hull)
+    inside = hull > -truncation
+    total[inside], weight[inside] = depth_evidence(grid.points[inside], maps, truncation)
     fused = fuse_depth(grid.shape, hull, prior, total, weight, truncation)
     return grid, *complete_by_symmetry(grid, fused, hull / truncation, references)
 
 
-def _bounds(
+def _prior(
     grid: Grid,
+    hull: FloatArray,
     starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
-    views: Sequence[ObjectView],
     references: Sequence[ObjectView],
     truncation: float,
-) -> tuple[FloatArray, FloatArray]:
-    """``(N,)`` signed distances from the hull, and from the shapes at hand where views do not show that they lack."""
-    measured = start_in_thread(partial(_start_distance, grid, starts, 1.2 * truncation), cv2.getNumThreads())
-    hull, _ = carve_hull(grid.points, views, 2 * truncation)
-    return hull, restore_uncovered(grid, hull, measured(), references)
-
-
-def _start_distance(
-    grid: Grid, starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]], far: float
 ) -> FloatArray:
-    """``(N,)`` signed distance from the shapes at hand; what one video has not shown is often missing from its own."""
-    return np.maximum.reduce([mesh_distance(grid, points, faces, far) for points, faces in starts])
+    """``(N,)`` signed distance from the shapes at hand, with that from the hull where views show that they lack it."""
+    distances = [mesh_distance(grid, points, faces, 1.2 * truncation) for points, faces in starts]
+    return restore_uncovered(grid, hull, np.maximum.reduce(distances), references)
 
 
 def _guide(
@@ -327,7 +325,6 @@ VARIATION = 0.5
 """Weight of the total variation of distances in truncations, voxel to voxel."""
 _STEEP = 0.1  # difference from voxel to voxel below which it counts with its square
 _ROUNDS = 80
-_STEP = 0.28  # the largest with which primal and dual steps converge in three dimensions is 1 / sqrt(12)
 
 
 def depth_evidence(
@@ -377,29 +374,16 @@ def fuse_depth(
         truncation: Distances are cut off there.
         variation: Weight of the total variation; 0 takes the mean as it is.
     """
-    sum_of_weights = torch.from_numpy(weight + np.float32(PRIOR)).reshape(shape)
-    held = PRIOR * np.clip(prior / truncation, -1, 1)
-    mean = torch.from_numpy((total / truncation + held).astype(np.float32)).reshape(shape) / sum_of_weights
-    most = torch.from_numpy(np.clip(hull / truncation, -1, 1).astype(np.float32)).reshape(shape)
-    # Primal and dual steps by turns (Chambolle and Pock, 2011), with a Huber norm of the gradient.
-    distance = torch.minimum(mean, most)
-    ahead, dual = distance.clone(), torch.zeros(3, *shape)
-    for _ in range(_ROUNDS if variation else 0):
-        for axis in range(3):
-            steps = shape[axis] - 1
-            dual[axis].narrow(axis, 0, steps).add_(ahead.diff(dim=axis), alpha=_STEP)
-        dual /= 1 + _STEP * _STEEP / variation
-        dual /= (dual.square().sum(0).sqrt_() / variation).clamp_min_(1)
-        last, distance = distance, distance.clone()
-        for axis in range(3):
-            steps = shape[axis] - 1
-            flow = dual[axis].narrow(axis, 0, steps)
-            distance.narrow(axis, 0, steps).add_(flow, alpha=_STEP)
-            distance.narrow(axis, 1, steps).sub_(flow, alpha=_STEP)
-        distance.add_(sum_of_weights * mean, alpha=_STEP).div_(1 + _STEP * sum_of_weights)
-        distance = torch.minimum(distance, most)
-        ahead = 2 * distance - last
-    return np.asarray(distance.numpy().ravel())
+    from tracking3d.reconstruction.kernels.visual_hull import vary_little
+
+    sum_of_weights = weight + np.float32(PRIOR)
+    mean = (total / truncation + PRIOR * np.clip(prior / truncation, -1, 1)) / sum_of_weights
+    parts = mean, sum_of_weights, np.clip(hull / truncation, -1, 1)
+    given = [np.ascontiguousarray(part, np.float32).reshape(shape) for part in parts]
+    distance = np.minimum(given[0], given[2])
+    if variation:
+        vary_little(*given, _STEEP, variation, _ROUNDS, distance)
+    return distance.ravel()
 
 
 def _sample_depth(

@@ -146,8 +146,9 @@ def _views(thumbnails: Sequence[Thumbnail], model: ObjectModel) -> list[Image]:
         return [_add_title(render_view(model, np.eye(3), TILE), "model")]
     indices = list(sides)
     chosen = most_different(np.stack(list(sides.values())), VIEWS)
+    look = look_of(model, TILE)
     return [
-        _add_title(render_view(model, sides[index], TILE), f"model as in #{index}")
+        _add_title(render_view(model, sides[index], TILE, look), f"model as in #{index}")
         for index in sorted(indices[one] for one in chosen)
     ]
 
@@ -253,24 +254,32 @@ def most_different(rotations: NDArray[np.float64], count: int) -> list[int]:
     return chosen
 
 
-def texture_of_views(model: ObjectModel, size: int) -> Tensor:
-    """The texture that views of a size sample ``(4, H, W)``: the colour of what was seen, and how much of it was.
+Look = tuple[Tensor, NDArray[np.float64]]
+"""What views of an object share, see `look_of`."""
+
+
+def look_of(model: ObjectModel, size: int) -> Look:
+    """The texture that views of a size sample ``(4, H, W)``: the colour of what was seen, and how much of it was. And
+    the normals ``(V, 3)``.
 
     Args:
         model: The object.
         size: Side of the views in pixels; a texture that is much finer is averaged.
     """
+    import trimesh  # slow to import
+
     seen = (model.texture_weight > 0)[..., None]
     layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
     while min(layers.shape[:2]) >= _FINEST * size:
         layers = cv2.resize(
             layers, (layers.shape[1] // 2, layers.shape[0] // 2), interpolation=cv2.INTER_AREA
         )
-    return torch.tensor(np.ascontiguousarray(layers.transpose(2, 0, 1)))
+    normals = trimesh.Trimesh(model.vertices, model.faces, process=False).vertex_normals
+    return torch.tensor(np.ascontiguousarray(layers.transpose(2, 0, 1))), np.asarray(normals)
 
 
 def render_view(
-    model: ObjectModel, rotation: NDArray[np.float64], size: int, texture: Tensor | None = None
+    model: ObjectModel, rotation: NDArray[np.float64], size: int, look: Look | None = None
 ) -> Image:
     """Draw the whole object, lit from the camera, into a square picture ``(size, size, 3)``.
 
@@ -280,11 +289,9 @@ def render_view(
         model: The object.
         rotation: ``(3, 3)`` object to camera.
         size: Side in pixels.
-        texture: See `texture_of_views`; made here if left out. Several views of one object share it.
+        look: See `look_of`; made here if left out. Several views of one object share it.
     """
-    import trimesh  # slow to import
-
-    texture = texture_of_views(model, size) if texture is None else texture
+    texture, normals = look_of(model, size) if look is None else look
     low, high = model.vertices.min(0), model.vertices.max(0)
     centred = (model.vertices - (low + high) / 2) @ rotation.T
     radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
@@ -295,7 +302,7 @@ def render_view(
     faces = torch.tensor(model.faces)
     face_index = rasterize(screen, depth, faces, (size, size)).face_index
 
-    normals = trimesh.Trimesh(centred, model.faces, process=False).vertex_normals
+    normals = normals @ rotation.T
     corners = np.concatenate([model.face_uvs, normals[model.faces], centred[model.faces] / radius], axis=2)
     uv, normal, at = interpolate(
         screen, depth, faces, torch.tensor(corners, dtype=torch.float32), face_index

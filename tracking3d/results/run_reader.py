@@ -18,7 +18,7 @@ from tracking3d.frames import pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import COUNTS, Lens
 from tracking3d.results import layout
-from tracking3d.results.description import is_gone
+from tracking3d.results.description import is_gone, stages_of
 from tracking3d.results.files import is_locked, read_mask, read_occluder, read_probability
 from tracking3d.results.mesh_export import load_mesh
 from tracking3d.results.records import FrameRecord, latest, read_stages
@@ -168,6 +168,11 @@ class RunReader:
             InputError: If a line before the last is damaged.
         """
         return latest(read_records(self.folder / layout.FRAMES), self.refined)
+
+    @cached_property
+    def causal_stages(self) -> StageTimes | None:
+        """Times of the causal estimates, stage by stage; an InputError as of `frames`."""
+        return stages_of(latest(read_records(self.folder / layout.FRAMES), refined=False))
 
     @cached_property
     def _refined_frames(self) -> frozenset[int]:

@@ -392,11 +392,13 @@ class RunWriter:
         records = list(read_records(self.folder / layout.FRAMES))
         figures = self._summarize(records)
         self._description |= figures | {"notes": notes_of_run(self._description, model, latest(records))}
-        self._write_contact_sheet(model)
+        self._write_contact_sheet(model, records)
 
-    def _write_contact_sheet(self, model: ObjectModel | None) -> None:
-        """Write the contact sheet of the frames so far; None leaves the model out."""
-        records = list(read_records(self.folder / layout.FRAMES))
+    def _write_contact_sheet(
+        self, model: ObjectModel | None, records: list[FrameRecord] | None = None
+    ) -> None:
+        """Write the contact sheet of the frames so far; None leaves the model out, or reads the records."""
+        records = list(read_records(self.folder / layout.FRAMES)) if records is None else records
         replaced = {record.index for record in latest(records) if record.revision and not record.refined}
         figures = self._summarize(records)
         sheet = self._pictures.contact_sheet(model, figures | self._description, replaced)

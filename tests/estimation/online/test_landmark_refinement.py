@@ -17,8 +17,10 @@ from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.pose_tracking import resect_pose
 from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.online.state.confidence import PoseCandidate
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracker import Tracker
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -228,3 +230,15 @@ def test_a_correction_that_is_too_large_is_not_taken():
     object_map, view, true = between()
     off = turned(true, 4.0 * np.array([0.6, 0.64, 0.48]))
     assert resect_pose(object_map, clip().camera, view, off) is off
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_of_the_frames_that_are_refined_lost_ones_alone_are_searched_as_a_whole(monkeypatch, lost):
+    state, searched = tracked(), []
+    monkeypatch.setattr(Tracker, "_elsewhere", lambda *given: searched.append(given))
+    monkeypatch.setattr(PoseCandidate, "doubtful", True)
+    monkeypatch.setattr(PoseCandidate, "lost", lost)
+    online, frame = OnlineSolver(solver().config, clip().camera, solver().encoder), clip().images[4]
+    T_cam_obj = state.last_pose[0].matrix().numpy()
+    online.refine_frame(state, Frame(4, frame), estimate_of(clip().masks[4]), T_cam_obj)
+    assert bool(searched) == lost

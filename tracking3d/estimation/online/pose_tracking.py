@@ -180,11 +180,10 @@ def resect_pose(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pos
     positions = [place for place, other in enumerate(object_map.keyframes) if other.index in near]
     scene = draw_keyframes(object_map, camera, positions)
     known = [position for position in positions if scene.views[position] is not None]
-    resected, share = resect(scene, drawn, known)
+    T, share = resect(scene, drawn, known)
     begun = sum(len(scene.seeds_of(position)[2]) for position in known)
     if share < _MIN_SHARE or share * begun < _MIN_AGREEING:
         return pose
-    T = resected.T_cam_obj
     corrected = pose_from_arrays(T[:3, :3], T[:3, 3], object_map.vertices)
     turn = float(rotation_angle(corrected.quaternion, pose.quaternion))
     return corrected if turn < _MAX_TURN else pose

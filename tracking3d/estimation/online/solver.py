@@ -265,7 +265,7 @@ class OnlineSolver:
         elif object_map.free_axis is not None and state.last_pose[1] == frame.index - 1:
             starts["last"] = state.last_pose[0]  # the causal pose may be of a surface that was another one
         view = view_frame(self.observer, state, frame, binary, causal, followed)
-        found = self.tracker.find(state, view, frame, image, starts)
+        found = self.tracker.find(state, view, frame, image, starts, again=True)
         before = state.last_pose if state.last_pose[1] == frame.index - 1 else None
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
         if found.lost:  # no better pose than the causal one was found

@@ -66,8 +66,12 @@ class Tracker:
         frame: Frame,
         image: NDArray[np.uint8],
         starts: dict[str, Pose],
+        again: bool = False,
     ) -> PoseCandidate:
-        """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful."""
+        """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful.
+
+        A doubtful frame that is looked at again was searched as a whole before; only a lost one is once more.
+        """
         object_map, camera = state.object_map, state.camera
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
@@ -86,7 +90,7 @@ class Tracker:
         if object_map.free_axis is not None:
             fit = replace(fit, pose=object_map.free_axis.untwisted(fit.pose, state.last_pose[0]))
         best = PoseCandidate(view, fit, won, kept, support, assessment)
-        if best.lost or (best.doubtful and should_retry(state.doubtful_frames)):
+        if best.lost or (best.doubtful and not again and should_retry(state.doubtful_frames)):
             other = self._elsewhere(state, frame, image, view.mask)
             return other if other is not None and other.better_than(best) else best
         return best

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.estimate import Status
-from tracking3d.results.description import stages_of
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import STAGES, StageTimes
@@ -105,8 +104,7 @@ def stage_shares(run: RunReader) -> list[StageShare]:
 
 def stage_times(run: RunReader) -> tuple[StageTimes | None, StageTimes]:
     """What the causal estimates took, stage by stage, and what the final refinement did."""
-    causal = stages_of(RunReader(run.folder, refined=False).frames)
-    return causal if run.frames else None, run.refinement_stages or StageTimes()
+    return run.causal_stages if run.frames else None, run.refinement_stages or StageTimes()
 
 
 def corrected_frames(run: RunReader) -> list[int]:

@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.rendering.backend import share_threads
 from tracking3d.results import layout
-from tracking3d.results.contact_sheet import render_view, side_shown, texture_of_views
+from tracking3d.results.contact_sheet import look_of, render_view, side_shown
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.layout import partial_path
 from tracking3d.results.mesh_export import load_model, split_mesh
@@ -66,15 +67,16 @@ def write_report(folder: Path, turntable: bool = True) -> Path:
         model, no_model = _model_of(run)
         front = _front(run, model)
         shown = model if turntable else None
-        movie = start_in_thread(partial(_write_movie, folder, shown, front), cv2.getNumThreads())
-        page = _page(run, model, front, no_model)
+        with share_threads(1):
+            movie = start_in_thread(partial(_write_movie, folder, shown, front), cv2.getNumThreads())
+            page = _page(run, model, front, no_model)
+            path = folder / layout.REPORT
+            write_atomic(path, page)
+            movie()
     except _DAMAGED as error:
         raise InputError(
             f"{folder / layout.RUN} is damaged ({type(error).__name__}: {error}); restore it."
         ) from error
-    path = folder / layout.REPORT
-    write_atomic(path, page)
-    movie()
     return path
 
 
@@ -481,12 +483,12 @@ def write_turntable(path: Path, model: ObjectModel, rotation: NDArray[np.float64
     Raises:
         OutputError: If it cannot be written.
     """
-    unfinished, texture = partial_path(path), texture_of_views(model, SIDE)
+    unfinished, look = partial_path(path), look_of(model, SIDE)
     try:
         with VideoWriter(unfinished, FPS, (SIDE, SIDE)) as video:
             for yaw in report_each("turntable", np.arange(VIEWS) * 360.0 / VIEWS):
                 turned = Rotation.from_euler("yx", [yaw, PITCH], degrees=True).as_matrix() @ rotation
-                video.write(render_view(model, turned, SIDE, texture))
+                video.write(render_view(model, turned, SIDE, look))
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
