@@ -29,6 +29,7 @@ from tracking3d.estimation.shape import flatten, unfold
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
+from tracking3d.rendering.surface import edges_of
 
 _APPEARANCE = 4.0  # weight of the mean photometric loss
 _APPEARANCE_SCALE = 0.25
@@ -51,10 +52,12 @@ class _Problem:
     weights: FitWeights
     K: Tensor  # (B, 3, 3) of the windows
     layers: NDArray[np.float32]  # see `layers_of`
+    edges: tuple[Tensor, Tensor]  # of the faces, see `edges_of`
     distance: Tensor  # (B, S, S) to the masks' outlines, pixels of the window
     mask_weight: Tensor  # (B,) how far each mask is trusted
     # (3 M, N) the shape unknowns for each change of the profile of a surface of revolution; None: all are free
     tied: Tensor | None = None
+    every: int = 1  # of the faces one in so many is compared
 
     @property
     def size(self) -> int:
@@ -95,7 +98,7 @@ class _Equations:
 
 
 def fit_jointly(
-    object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights, iterations: int
+    object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights, iterations: int, every: int = 1
 ) -> tuple[ObjectMap, float]:
     """The map with vertices and keyframe poses, except the first, that explain its keyframes better; their cost.
 
@@ -104,11 +107,12 @@ def fit_jointly(
         modes: The basis of the shape's offsets.
         weights: The weights of outline and smoothness.
         iterations: The most evaluations after the first.
+        every: Of the faces one in so many is compared.
     """
     axis, tied = object_map.free_axis, None
     if axis is not None:
         modes, tied = axis.basis(object_map.vertices)
-    problem = replace(_problem(object_map, modes, weights), tied=tied)
+    problem = replace(_problem(object_map, modes, weights), tied=tied, every=every)
     free = torch.ones(problem.unknowns, dtype=torch.bool)
     if axis is None:
         free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
@@ -152,6 +156,7 @@ def _problem(object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights) -> _
         weights,
         torch.stack([o.K for o in observations]),
         layers_of(torch.stack([o.features for o in observations]), valid),
+        edges_of(object_map.shape.faces),
         torch.stack([o.outline_distance for o in observations]),
         torch.tensor(believed).to(object_map.vertices),
     )
@@ -216,7 +221,7 @@ def _evaluate(problem: _Problem, vertices: Tensor, R: Tensor, t: Tensor) -> _Sta
         vertices, object_map.shape.faces, object_map.shape.face_uvs, vertices.new_zeros(1, 8, 8), R, t, problem.K,
         (problem.size, problem.size), backend=object_map.renderer,
     )  # fmt: skip
-    faces = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE)
+    faces = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE, problem.every)
     outlines, outline_cost = _outlines(problem, drawn)
     stiffness, offsets = _bending(problem, vertices)
     cost = _APPEARANCE * faces.cost + outline_cost + float((stiffness * offsets.square()).sum())
@@ -243,7 +248,7 @@ def _bending(problem: _Problem, vertices: Tensor) -> tuple[Tensor, Tensor]:
 
 def _outlines(problem: _Problem, drawn: Rendering) -> tuple[OutlineResiduals, float]:
     """The rendered outlines' distances from the masks', and their cost."""
-    weights, contour = problem.weights, find_contour(drawn)
+    weights, contour = problem.weights, find_contour(drawn, problem.edges)
     view = contour.view
     scale = _FULL_SIZE / problem.size
     residual, slope = (part * scale for part in contour_slopes(contour, problem.distance))

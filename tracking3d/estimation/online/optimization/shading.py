@@ -19,10 +19,9 @@ from torch.nn import functional
 
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.rendering import Contour, Rendering
-from tracking3d.rendering.normal_equations import screen_motion
 
 if TYPE_CHECKING:
-    from tracking3d.estimation.online.optimization.kernels.shading import ContourPoints, Drawn, Sights
+    from tracking3d.estimation.online.optimization.kernels.shading import Sights
 
 FloatArray = NDArray[np.float64]
 _SINGLE = (
@@ -36,7 +35,7 @@ class SharedFaces:
     """What B views show of the faces that two views or more show, C channels."""
 
     cost: float  # the mean Cauchy loss, of what one view alone shows too
-    drawn: Drawn
+    drawn: tuple[NDArray[Any], ...]  # x_cam, screen, depth, K and faces of the rendering
     sights: Sights
     ends: NDArray[np.int64]  # (N + 1,) where the sights of each of N faces end
     light: FloatArray  # (C, 3)
@@ -64,27 +63,29 @@ def layers_of(features: Tensor, valid: Tensor) -> NDArray[np.float32]:
     return layers.contiguous().cpu().float().numpy()
 
 
-def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float) -> SharedFaces:
+def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float, every: int = 1) -> SharedFaces:
     """What the views show of the same faces at the present shape and poses.
 
     Args:
         drawn: The rendering.
         layers: From `layers_of`.
         scale: Difference of features at which the loss is ``log 2``.
+        every: Only each so many faces are compared.
     """
     from tracking3d.estimation.online.optimization.kernels import shading
 
     tensors = drawn.x_cam, drawn.screen, drawn.depth, drawn.K
-    arrays = shading.Drawn(*(_array(one, np.float32) for one in tensors), _array(drawn.faces, np.int64))
-    most, channels = len(arrays.faces) * len(arrays.x_cam), layers.shape[3] // 3
+    x_cam, *rest = (_array(one, np.float32) for one in tensors)
+    faces = _array(drawn.faces, np.int64)
+    arrays = x_cam, *rest, faces
+    most, channels = len(faces) * len(x_cam), layers.shape[3] // 3
     sights = shading.Sights(
         np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, 3)), np.empty((most, 3 * channels)),
         np.empty(most), np.empty((most, channels)), np.empty((most, channels)),
     )  # fmt: skip
-    ends, totals = np.zeros(len(arrays.faces) + 1, np.int64), np.zeros(2)
-    first = arrays.x_cam[0]
-    radius = float(np.linalg.norm(first - first.mean(0), axis=1).max())
-    ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals) + 1]
+    ends, totals = np.zeros(len(faces) + 1, np.int64), np.zeros(2)
+    radius = float(np.linalg.norm(x_cam[0] - x_cam[0].mean(0), axis=1).max())
+    ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals, every) + 1]
     sights = shading.Sights(*(one[: ends[-1]] for one in sights))
     whole, light = max(totals[0], 1e-9), np.zeros((channels, 3))
     sights.weight[:] /= whole * channels
@@ -109,52 +110,32 @@ def normal_equations(
     """
     from tracking3d.estimation.online.optimization.kernels import shading
 
-    points = _contour_points(outlines, shown.drawn.K, R, t)
+    (_, _, _, K, faces), contour = shown.drawn, outlines.contour
+    vertices = _array(contour.vertices, np.int64)
     seen = np.zeros(len(modes.vectors), bool)
-    seen[shown.drawn.faces[shown.sights.face]] = True
-    seen[points.vertices] = True
+    seen[faces[shown.sights.face]] = True
+    seen[vertices] = True
     basis = _array(modes.vectors, np.float64)[seen]
-    (vertices, count), channels = basis.shape, len(shown.light)
-    others = 6 * len(R) + 3 * channels
-    unknowns = shading.Unknowns(
-        seen.cumsum() - 1,
-        basis,
-        np.zeros((vertices, 6 * count + 3 * (others + 1))),
-        np.zeros((others, others + 1)),
-    )
-    R64, t64 = _array(R, np.float64), _array(t, np.float64)
-    own = factor * 2 / shown.scale**2
-    shading.add_faces(shown.drawn, shown.sights, shown.ends, shown.light, R64, t64, own, unknowns)
-    shading.add_outlines(points, unknowns)
-    sums = basis.T @ unknowns.sums
-    shape = np.empty((count, 3, count, 3))
+    count, channels, poses = basis.shape[1], len(shown.light), 6 * len(R)
+    others, own = poses + 3 * channels, factor * 2 / shown.scale**2
+    sums, rest = np.zeros((len(basis), 6 * count + 3 * (others + 1))), np.zeros((others, others + 1))
+    at_vertices = seen.cumsum() - 1, basis, sums, rest
+    turns, moves = _array(R, np.float64), _array(t, np.float64)
+    shading.add_faces(shown.drawn, shown.sights, shown.ends, shown.light, turns, moves, own, at_vertices)
+    residuals = torch.stack([outlines.residual, outlines.weight], 1)
+    parts = (_array(one, np.float64) for one in (contour.share, contour.points, outlines.slope, residuals))
+    shading.add_outlines(_array(contour.view, np.int64), vertices, *parts, K, turns, moves, at_vertices)
+    rest.reshape(-1)[poses * (others + 1) + poses :: others + 2] += own * _RIDGE / channels
+    sums = basis.T @ sums
+    mixed = sums[:, 6 * count :].reshape(3 * count, others + 1)
+    matrix = np.empty((3 * count + others, 3 * count + others))
     for row, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
         part = sums[:, row * count : (row + 1) * count]
-        shape[:, i, :, j], shape[:, j, :, i] = part, part.T
-    mixed = sums[:, 6 * count :].reshape(3 * count, others + 1)
-    rest = np.triu(unknowns.rest[:, :-1]) + np.triu(unknowns.rest[:, :-1], 1).T
-    rest.reshape(-1)[(6 * len(R)) * (others + 1) :: others + 1] += own * _RIDGE / channels
-    matrix = np.block([[shape.reshape(3 * count, -1), mixed[:, :-1]], [mixed[:, :-1].T, rest]])
-    return matrix, np.concatenate([mixed[:, -1], unknowns.rest[:, -1]])
-
-
-def _contour_points(
-    outlines: OutlineResiduals, K: NDArray[np.float32], R: Tensor, t: Tensor
-) -> ContourPoints:
-    """The outlines' residuals with their derivatives by points and poses."""
-    from tracking3d.estimation.online.optimization.kernels.shading import ContourPoints as Points
-
-    contour = outlines.contour
-    view = contour.view
-    motion = screen_motion(contour.points, torch.from_numpy(K).to(t)[view], t[view])
-    by_pose = torch.einsum("ni,nia->na", outlines.slope, motion)
-    by_point = torch.einsum("na,nab->nb", by_pose[:, :3], R[view])
-    parts = contour.share, by_point, by_pose, outlines.residual, outlines.weight
-    return Points(
-        _array(view, np.int64),
-        _array(contour.vertices, np.int64),
-        *(_array(part, np.float64) for part in parts),
-    )
+        matrix[i : 3 * count : 3, j : 3 * count : 3] = part
+        matrix[j : 3 * count : 3, i : 3 * count : 3] = part.T
+    matrix[: 3 * count, 3 * count :], matrix[3 * count :, : 3 * count] = mixed[:, :-1], mixed[:, :-1].T
+    matrix[3 * count :, 3 * count :] = np.triu(rest[:, :-1]) + np.triu(rest[:, :-1], 1).T
+    return matrix, np.concatenate([mixed[:, -1], rest[:, -1]])
 
 
 def _array(tensor: Tensor, kind: type[np.generic]) -> NDArray[Any]:

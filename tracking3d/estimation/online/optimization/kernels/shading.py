@@ -7,7 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import float32, float64, int64, void
+from numba import float32, float64, int64, types, void
 from numpy.typing import NDArray
 
 from tracking3d.points.bundle_adjustment.kernels.reprojection import (
@@ -35,60 +35,31 @@ class Sights(NamedTuple):
     used: NDArray[np.float64]
 
 
-class Drawn(NamedTuple):
-    """A rendering of V vertices in B views, with cameras and F faces."""
-
-    x_cam: NDArray[np.float32]  # (B, V, 3); screen: (B, V, 2)
-    screen: NDArray[np.float32]
-    depth: NDArray[np.float32]  # (B, S, S), infinite where nothing is drawn
-    K: NDArray[np.float32]  # (B, 3, 3)
-    faces: NDArray[np.int64]  # (F, 3)
-
-
-class ContourPoints(NamedTuple):
-    """N points of outlines, see `tracking3d.rendering.Contour`, with their residuals' derivatives."""
-
-    view: NDArray[np.int64]  # (N,)
-    vertices: NDArray[np.int64]  # (N, 2); share: (N, 2) of either vertex
-    share: NDArray[np.float64]
-    by_point: NDArray[np.float64]  # (N, 3) derivatives by the point in object coordinates; by_pose: (N, 6)
-    by_pose: NDArray[np.float64]
-    residual: NDArray[np.float64]  # (N,); weight: (N,)
-    weight: NDArray[np.float64]
-
-
-class Unknowns(NamedTuple):
-    """Sums of normal equations, at the V' vertices that are seen and in the G unknowns of poses and light."""
-
-    place: NDArray[np.int64]  # (V,) of each vertex among those that are seen
-    basis: NDArray[np.float64]  # (V', M) the modes there
-    # (V', 6 M + 3 G + 3): the blocks' xx, xy, xz, yy, yz, zz times the modes; of x, y, z with the others, and gradient
-    sums: NDArray[np.float64]
-    rest: NDArray[np.float64]  # (G, G + 1) of the other unknowns, last the gradient
-
-
+# What was drawn: x_cam (B, V, 3), screen (B, V, 2), depth (B, S, S), K (B, 3, 3) and faces (F, 3), as in `Rendering`.
+_DRAWN = types.Tuple(
+    (float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], int64[:, ::1])
+)
 _SIGHTS = record(
     Sights, int64[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1], float64[:, ::1]
 )  # fmt: skip
-_DRAWN = record(
-    Drawn, float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], int64[:, ::1]
-)
-_POINTS = record(
-    ContourPoints, int64[::1], int64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
-    float64[::1],
-)  # fmt: skip
-_UNKNOWNS = record(Unknowns, int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])
+# Where sums are added: place (V,) of each vertex among the V' that are seen; basis (V', M) of the modes there; sums
+# (V', 6 M + 3 G + 3), of which 6 M are the blocks' xx, xy, xz, yy, yz and zz times the modes, and the rest those of x,
+# y and z with the G unknowns of poses and light, last the gradient; and (G, G + 1) of those, the upper triangle.
+_SUMS = types.Tuple((int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]))
 
 
-@kernel(int64(_DRAWN, float32[:, :, :, ::1], float64, _SIGHTS, int64[::1], float64[::1]))
-def find_sights(drawn, layers, radius, sights, ends, totals):
-    """Write the sights of each face, where each face's end, and the weights of all and of these; how many faces."""
+@kernel(int64(_DRAWN, float32[:, :, :, ::1], float64, _SIGHTS, int64[::1], float64[::1], int64))
+def find_sights(drawn, layers, radius, sights, ends, totals, every):
+    """Write the sights of each face, where each face's end, and the weights of all and of these; how many faces.
+
+    Every so many faces are taken.
+    """
     face_of, view_of, normals, values, weights, _, _ = sights
     x_cam, screen, depth, K, faces = drawn
     size, count = depth.shape[1], layers.shape[3]
     corner, normal, sampled = np.empty((3, 3)), np.empty(3), np.empty(count)
     last, found = 0, 0
-    for face in range(len(faces)):
+    for face in range(0, len(faces), every):
         a, b, c = faces[face]
         first, largest = last, 0.0
         for view in range(len(x_cam)):
@@ -163,13 +134,11 @@ def _sample(layers, x, y, sampled):
 @kernel(float64(_SIGHTS, int64[::1], float64, float64, float64[:, ::1]))
 def shade(sights, ends, scale, ridge, light):
     """Write the light, residuals and their weights as in the matrix of the Cauchy loss; the loss."""
-    normals, values, weights, residual, used = (
-        sights.normal, sights.values, sights.weight, sights.residual, sights.used
-    )  # fmt: skip
+    normals, values, used = sights.normal, sights.values, sights.used
     channels = len(light)
     system, side, mean, loss = np.empty((channels, 3, 3)), np.empty((channels, 3)), np.empty(3), 0.0
-    for sight in range(len(weights)):
-        used[sight] = weights[sight]
+    for sight in range(len(used)):
+        used[sight] = sights.weight[sight]
     for _ in range(_ROUNDS):
         for c in range(channels):
             system[c], side[c] = 0, 0
@@ -237,15 +206,13 @@ def _robust(sights, ends, light, scale):
 
 
 @kernel(
-    void(
-        _DRAWN, _SIGHTS, int64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64, _UNKNOWNS
-    )
+    void(_DRAWN, _SIGHTS, int64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64, _SUMS)
 )
-def add_faces(drawn, sights, ends, light, R, t, factor, unknowns):
+def add_faces(drawn, sights, ends, light, R, t, factor, at_vertices):
     """Add ``factor`` times the residuals' equations; each face's own colour, the weighted mean, is eliminated."""
-    channels, most, rest = len(light), 9 + 6 * len(R), unknowns.rest
-    lamp = rest.shape[1] - 1 - 3 * channels
-    # A face's unknowns are its corners' nine and six for each view that sees it.
+    faces, rest = drawn[4], at_vertices[3]
+    channels, most = len(light), 9 + 6 * len(R)
+    # A face's unknowns are its corners' nine and six for each view that sees it; the light's are apart.
     scratch, slopes, own = np.empty((7, 3)), np.empty((channels, 16)), np.empty((15, 16))
     block, lamps, mean = np.empty((most, most)), np.empty((channels, 3, most)), np.empty((channels, most))
     total, tilt, gradient = np.empty(channels), np.empty((channels, 3)), np.empty(9)
@@ -254,7 +221,7 @@ def add_faces(drawn, sights, ends, light, R, t, factor, unknowns):
         width = 9 + 6 * (last - first)
         block[:width, :width], lamps[:], mean[:], total[:], tilt[:], gradient[:] = 0, 0, 0, 0, 0, 0
         for sight in range(first, last):
-            at, pose, normal = 9 + 6 * (sight - first), 6 * sights.frame[sight], sights.normal[sight]
+            at, normal = 9 + 6 * (sight - first), sights.normal[sight]
             _derivatives(drawn, sights, sight, light, R, t, scratch, slopes)
             own[:] = 0
             for c in range(channels):
@@ -275,8 +242,9 @@ def add_faces(drawn, sights, ends, light, R, t, factor, unknowns):
                         lamps[c, i, j] -= by * slope[j]
                     for j in range(6):
                         lamps[c, i, at + j] = -by * slope[9 + j]
+                    lamp = rest[rest.shape[0] - 3 * (channels - c) + i]
                     for j in range(i, 3):
-                        rest[lamp + 3 * c + i, lamp + 3 * c + j] += by * normal[j]
+                        lamp[rest.shape[0] - 3 * (channels - c) + j] += by * normal[j]
             for i in range(9):
                 gradient[i] += own[i, 15]
                 for j in range(i, 9):
@@ -284,76 +252,77 @@ def add_faces(drawn, sights, ends, light, R, t, factor, unknowns):
                 for j in range(6):
                     block[i, at + j] = own[i, 9 + j]
             for i in range(6):
-                rest[pose + i, rest.shape[1] - 1] += own[9 + i, 15]
+                rest[6 * sights.frame[sight] + i, rest.shape[0]] += own[9 + i, 15]
                 for j in range(i, 6):
                     block[at + i, at + j] = own[9 + i, 9 + j]
         for c in range(channels):
-            inverse = 1 / max(total[c], 1e-20)
             for i in range(width):
-                by = mean[c, i] * inverse
+                by = mean[c, i] / total[c]
                 for j in range(i, width):
                     block[i, j] -= by * mean[c, j]
             for i in range(3):
-                by = tilt[c, i] * inverse
+                by = tilt[c, i] / total[c]
                 for j in range(width):
                     lamps[c, i, j] += by * mean[c, j]
+                lamp = rest[rest.shape[0] - 3 * (channels - c) + i]
                 for j in range(i, 3):
-                    rest[lamp + 3 * c + i, lamp + 3 * c + j] -= by * tilt[c, j]
-        for i in range(9):
-            for j in range(i):
-                block[i, j] = block[j, i]
-        for sight in range(first, last):
-            at, pose = 9 + 6 * (sight - first), 6 * sights.frame[sight]
-            for i in range(6):
-                for other in range(sight, last):
-                    there, column = 6 * sights.frame[other], 9 + 6 * (other - first)
-                    for j in range(i if other == sight else 0, 6):
-                        rest[pose + i, there + j] += block[at + i, column + j]
-                for c in range(channels):
-                    for j in range(3):
-                        rest[pose + i, lamp + 3 * c + j] += lamps[c, j, at + i]
-        _add_corners(
-            drawn.faces[sights.face[first]], sights.frame[first:last], block, lamps, gradient, unknowns
-        )
+                    lamp[rest.shape[0] - 3 * (channels - c) + j] -= by * tilt[c, j]
+        _add_block(faces[sights.face[first]], sights.frame[first:last], block, lamps, gradient, at_vertices)
 
 
 @shared
 def _derivatives(drawn, sights, sight, light, R, t, scratch, slopes):
     """Write those of a view's values, less the light's part, by corners and pose ``(C, 15)``; last the residuals."""
+    x_cam, _, _, K, faces = drawn
     view, normal, values = sights.frame[sight], sights.normal[sight], sights.values[sight]
-    corner, across, moving, by = scratch[:3], scratch[4], scratch[5], scratch[6]
-    a, b, c = drawn.faces[sights.face[sight]]
-    length = _normal_of(drawn.x_cam[view], a, b, c, corner, scratch[3])
-    x, y, z = corner[0] + corner[1] + corner[2]
-    x, y, z = x / 3, y / 3, z / 3
-    fx, fy = drawn.K[view, 0, 0] / z, drawn.K[view, 1, 1] / z
-    channels, turn = len(light), R[view]
+    corner, across, moving, by, turning = scratch[:3], scratch[3], scratch[4], scratch[5], scratch[6]
+    a, b, c = faces[sights.face[sight]]
+    length = _normal_of(x_cam[view], a, b, c, corner, across)
+    middle = (corner[0] + corner[1] + corner[2]) / 3
+    channels = len(light)
     for ch in range(channels):
         slope = slopes[ch]
+        slope[9:] = 0
         slope[15] = sights.residual[sight, ch]
-        by_x, by_y = values[channels + ch] * fx, values[2 * channels + ch] * fy
-        moving[0], moving[1], moving[2] = by_x, by_y, -(by_x * x + by_y * y) / z
+        _motion(values[channels + ch], values[2 * channels + ch], middle, K[view], moving)
         along = light[ch, 0] * normal[0] + light[ch, 1] * normal[1] + light[ch, 2] * normal[2]
         for i in range(3):
             across[i] = (light[ch, i] - along * normal[i]) / length
-            slope[9 + i], slope[12 + i] = moving[i], 0
         for k in range(3):
-            begin, end, arm = corner[(k + 1) % 3], corner[(k + 2) % 3], corner[k]
+            _cross(across, corner[(k + 1) % 3], corner[(k + 2) % 3], turning)
             for i in range(3):
-                p, q = (i + 1) % 3, (i + 2) % 3
-                by[i] = moving[i] / 3 - (across[p] * (end[q] - begin[q]) - across[q] * (end[p] - begin[p]))
+                by[i] = moving[i] / 3 - turning[i]
+            _cross(by, corner[k], t[view], turning)
             for i in range(3):
-                p, q = (i + 1) % 3, (i + 2) % 3
-                slope[12 + i] += (arm[p] - t[view, p]) * by[q] - (arm[q] - t[view, q]) * by[p]
-                slope[3 * k + i] = by[0] * turn[0, i] + by[1] * turn[1, i] + by[2] * turn[2, i]
+                slope[9 + i] += by[i]
+                slope[12 + i] += turning[i]
+                slope[3 * k + i] = by[0] * R[view, 0, i] + by[1] * R[view, 1, i] + by[2] * R[view, 2, i]
 
 
 @shared
-def _add_corners(corners, frames, block, lamps, gradient, unknowns):
-    """Add a face's equations in its corners to those at the vertices."""
-    place, basis, sums, rest = unknowns
-    count, width, channels = basis.shape[1], rest.shape[1], len(lamps)
+def _motion(by_x, by_y, point, K, moving):
+    """Write the derivatives by a point in the camera's axes of what has such slopes by the screen's x and y."""
+    moving[0], moving[1] = by_x * K[0, 0] / point[2], by_y * K[1, 1] / point[2]
+    moving[2] = -(moving[0] * point[0] + moving[1] * point[1]) / point[2]
+
+
+@shared
+def _cross(by, begin, end, product):
+    """Write the cross product of ``by`` and the way from ``begin`` to ``end``."""
+    for i in range(3):
+        p, q = (i + 1) % 3, (i + 2) % 3
+        product[i] = by[p] * (end[q] - begin[q]) - by[q] * (end[p] - begin[p])
+
+
+@shared
+def _add_block(corners, frames, block, lamps, gradient, at_vertices):
+    """Add a face's equations to the sums; of the block only the upper triangle is given."""
+    place, basis, sums, rest = at_vertices
+    count, width = basis.shape[1], rest.shape[1]
     p, q, r = basis[place[corners[0]]], basis[place[corners[1]]], basis[place[corners[2]]]
+    for i in range(9):
+        for j in range(i):
+            block[i, j] = block[j, i]
     for k in range(3):
         row, at = sums[place[corners[k]]], 0
         for i in range(3):
@@ -364,43 +333,62 @@ def _add_corners(corners, frames, block, lamps, gradient, unknowns):
                     target[mode] += first * p[mode] + second * q[mode] + third * r[mode]
                 at += count
         for i in range(3):
-            for number in range(len(frames)):
-                for j in range(6):
-                    row[at + 6 * frames[number] + j] += block[3 * k + i, 9 + 6 * number + j]
-            for c in range(channels):
-                for j in range(3):
-                    row[at + width - 1 - 3 * (channels - c) + j] += lamps[c, j, 3 * k + i]
+            _add_row(row[at : at + width], frames, block[3 * k + i], 0, lamps, 3 * k + i)
             row[at + width - 1] += gradient[3 * k + i]
             at += width
+    for number in range(len(frames)):
+        for i in range(6):
+            line = 9 + 6 * number + i
+            _add_row(rest[6 * frames[number] + i], frames, block[line], line, lamps, line)
 
 
-@kernel(void(_POINTS, _UNKNOWNS))
-def add_outlines(points, unknowns):
-    """Add the outlines' residuals."""
-    view, vertices, shares, by_point, by_pose, residual, weight = points
-    place, basis, sums, rest = unknowns
+@shared
+def _add_row(row, frames, line, begin, lamps, number):
+    """Add to a row what it shares with the poses, from a place of the line on, and with the light."""
+    channels = len(lamps)
+    for place in range(len(frames)):
+        for j in range(max(begin - 9 - 6 * place, 0), 6):
+            row[6 * frames[place] + j] += line[9 + 6 * place + j]
+    for c in range(channels):
+        for j in range(3):
+            row[len(row) - 1 - 3 * (channels - c) + j] += lamps[c, j, number]
+
+
+@kernel(
+    void(
+        int64[::1], int64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],
+        float32[:, :, ::1], float64[:, :, ::1], float64[:, ::1], _SUMS,
+    )
+)  # fmt: skip
+def add_outlines(frames, vertices, shares, points, slopes, residuals, K, R, t, at_vertices):
+    """Add the outlines' equations; ``residuals`` ``(N, 2)`` have their weights beside them."""
+    place, basis, sums, rest = at_vertices
     count, width = basis.shape[1], rest.shape[1]
-    here = np.empty(count)
-    for n in range(len(view)):
-        pose, first, second = 6 * view[n], place[vertices[n, 0]], place[vertices[n, 1]]
+    here, moving, by_point, by_pose = np.empty(count), np.empty(3), np.empty(3), np.empty(6)
+    for n in range(len(frames)):
+        view, pose, first, second = frames[n], 6 * frames[n], place[vertices[n, 0]], place[vertices[n, 1]]
+        _motion(slopes[n, 0], slopes[n, 1], points[n], K[view], moving)
+        by_pose[:3] = moving
+        _cross(moving, points[n], t[view], by_pose[3:])
+        for i in range(3):
+            by_point[i] = moving[0] * R[view, 0, i] + moving[1] * R[view, 1, i] + moving[2] * R[view, 2, i]
         for mode in range(count):
             here[mode] = shares[n, 0] * basis[first, mode] + shares[n, 1] * basis[second, mode]
         for k in range(2):
-            at, row = 0, sums[second if k else first]
+            at, row, weight = 0, sums[second if k else first], residuals[n, 1] * shares[n, k]
             for i in range(3):
                 for j in range(i, 3):
-                    pull = weight[n] * shares[n, k] * by_point[n, i] * by_point[n, j]
+                    pull, target = weight * by_point[i] * by_point[j], row[at : at + count]
                     for mode in range(count):
-                        row[at + mode] += pull * here[mode]
+                        target[mode] += pull * here[mode]
                     at += count
             for i in range(3):
-                by = weight[n] * shares[n, k] * by_point[n, i]
-                row[at + width - 1] += by * residual[n]
+                row[at + width - 1] += weight * by_point[i] * residuals[n, 0]
                 for j in range(6):
-                    row[at + pose + j] += by * by_pose[n, j]
+                    row[at + pose + j] += weight * by_point[i] * by_pose[j]
                 at += width
         for i in range(6):
-            by = weight[n] * by_pose[n, i]
-            rest[pose + i, width - 1] += by * residual[n]
+            by = residuals[n, 1] * by_pose[i]
+            rest[pose + i, width - 1] += by * residuals[n, 0]
             for j in range(i, 6):
-                rest[pose + i, pose + j] += by * by_pose[n, j]
+                rest[pose + i, pose + j] += by * by_pose[j]
