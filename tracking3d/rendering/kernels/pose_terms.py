@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import torch
-from numba import boolean, float32, float64, int64, void
+from numba import boolean, float32, float64, int64, types, void
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -25,11 +25,11 @@ from tracking3d.rendering.kernels.compilation import (
     share,
 )
 from tracking3d.rendering.kernels.interpolation import barycentrics, slopes_of_face
-from tracking3d.rendering.kernels.normal_equations import of_channels, point_motion
 from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
 from tracking3d.rendering.kernels.visibility import draw_view
 from tracking3d.rendering.normal_equations import NormalEquations
 from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
+from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.surface import Surface
 
 # mypy: disable-error-code="no-untyped-def"
@@ -182,6 +182,54 @@ def _pose_terms(surface, target, matches, R, t, scales, sums, counts, first, las
         terms_of_pose(surface, target, matches, R[pose], t[pose], scales, buffers, sums[pose], counts[pose])
 
 
+def equations_of_pixels(
+    drawn: Rendering, observed: Tensor, pivot: Tensor, scale: float, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `tracking3d.rendering.pose_normal_equations`; ``observed`` is ``(B, H, W, C)``."""
+    check_corners(drawn.faces, drawn.screen)
+    shape = drawn.face_index.shape
+    comparable = weight.new_zeros(drawn.face_index.numel()).index_copy(0, drawn.pixels, weight).reshape(shape)
+    layers = torch.cat([drawn.texture, torch.ones_like(drawn.texture[:1])]).permute(1, 2, 0)
+    none = np.empty((0, 0), np.int64)
+    surface = SurfaceArrays(
+        np.empty((0, 3), np.float32), array(drawn.faces), array(drawn.face_uvs), none, none.reshape(-1),
+        array(layers),
+    )  # fmt: skip
+    views = observed, comparable, drawn.K, drawn.x_cam, drawn.screen, drawn.depth.reciprocal(), pivot
+    sums = np.zeros((len(pivot), 7, 7))
+    share(
+        _equations_of_pixels,
+        len(pivot),
+        2,
+        surface,
+        array(drawn.face_index),
+        tuple(map(array, views)),
+        scale,
+        sums,
+    )
+    found = torch.from_numpy(sums).to(drawn.screen)
+    return found[:, :6, :6], found[:, 6, :6], found[:, 6, 6]
+
+
+_PLANES, _ROWS = float32[:, :, ::1], float32[:, ::1]
+
+
+@kernel(
+    void(
+        SURFACE, int64[:, :, ::1], types.Tuple((float32[:, :, :, ::1], *[_PLANES] * 5, _ROWS)), float64,
+        float64[:, :, ::1], int64, int64,
+    )
+)  # fmt: skip
+def _equations_of_pixels(surface, face_index, views, scale, sums, first, last):
+    observed, comparable, K, x_cam, screen, inverse_depth, pivot = views
+    nowhere, counts = np.empty((0, 0), np.bool_), np.zeros(4)
+    for view in range(first, last):
+        target = TargetArrays(observed[view], comparable[view], nowhere, nowhere, comparable[view], K[view])
+        buffers = DrawingBuffers(x_cam[view], screen[view], face_index[view], inverse_depth[view])
+        depth = np.ascontiguousarray(x_cam[view, :, 2])
+        _of_pixels(surface, target, buffers, depth, pivot[view], scale, sums[view], counts)
+
+
 @numba.njit(**OPTIONS)
 def terms_of_pose(surface, target, matches, R, t, scales, buffers, sums, counts):
     """Add one pose's terms to zeros: ``sums`` ``(3, 7, 7)`` and ``counts`` ``(4,)``, by the places above."""
@@ -223,7 +271,7 @@ def _count_overlap(face_index, inside, mask, counts):
 
 @numba.njit(fastmath=REORDER, **OPTIONS)
 def _of_pixels(surface, target, buffers, depth, pivot, scale, sums, counts):
-    """Mean loss of the features over the covered pixels; see `tracking3d.rendering.kernels.normal_equations`."""
+    """Mean loss of the features over the covered pixels; see `tracking3d.rendering.normal_equations`."""
     faces, face_uvs, layers = surface.faces, surface.face_uvs, surface.layers
     features, comparable, K = target.features, target.comparable, target.K
     screen, face_index, inverse_depth = buffers.screen, buffers.face_index, buffers.inverse_depth
@@ -271,11 +319,11 @@ def _of_pixels(surface, target, buffers, depth, pivot, scale, sums, counts):
                 texels_u, texels_v = z * np.float32(width), z * np.float32(height)
                 by_x = (xa * ua + xb * ub + xc * uc) * texels_u, (xa * va + xb * vb + xc * vc) * texels_v
                 by_y = (ya * ua + yb * ub + yc * uc) * texels_u, (ya * va + yb * vb + yc * vc) * texels_v
-                xx, xy, yy, gx, gy, loss = of_channels(
+                xx, xy, yy, gx, gy, loss = _of_channels(
                     layers, taps, features[y, column], channels, sharpness, by_x, by_y
                 )
                 ray_x, ray_y = (np.float32(column) - cx) / fx, (np.float32(y) - cy) / fy
-                point_motion(ray_x, ray_y, z, fx, fy, pivot, motion)
+                _point_motion(ray_x, ray_y, z, fx, fy, pivot, motion)
                 for i in range(6):
                     left_x = weight * (xx * motion[0, i] + xy * motion[1, i])
                     left_y = weight * (xy * motion[0, i] + yy * motion[1, i])
@@ -286,6 +334,50 @@ def _of_pixels(surface, target, buffers, depth, pivot, scale, sums, counts):
                 sums[6, 6] += weight * loss
     counts[KNOWN] = total
     _finish(sums, max(total, 1.0) * channels)
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
+    """Terms of one pixel, summed over the channels: the 2 x 2 matrix, the two slopes of half the loss, and the loss.
+
+    ``by_x`` and ``by_y`` are the derivatives of the place in the texture, in texels, by the pixel's x and y.
+    """
+    one = np.float32(1)
+    _, _, _, _, fx, fy, free = taps
+    w00, w01, w10, w11 = bilinear_weights(taps)
+    t00, t01, t10, t11 = texels_at(texture, taps)
+    down = one if free else np.float32(0)
+    xx = xy = yy = x = y = np.float32(0)
+    loss, product = 0.0, 1.0
+    for c in range(channels):
+        d = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
+        along_u = (one - fy) * (t01[c] - t00[c]) + fy * (t11[c] - t10[c])
+        along_v = down * ((one - fx) * (t10[c] - t00[c]) + fx * (t11[c] - t01[c]))
+        gx = along_u * by_x[0] + along_v * by_x[1]
+        gy = along_u * by_y[0] + along_v * by_y[1]
+        factor = one + d * d * sharpness
+        robust = sharpness / factor
+        xx += robust * gx * gx
+        xy += robust * gx * gy
+        yy += robust * gy * gy
+        x += robust * gx * d
+        y += robust * gy * d
+        product *= np.float64(factor)
+        if product > 1e200:
+            loss += math.log(product)
+            product = 1.0
+    return xx, xy, yy, x, y, loss + math.log(product)
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _point_motion(ray_x, ray_y, z, fx, fy, pivot, motion):
+    """Motion on the screen ``(2, 6)`` by (v, w) of the surface point at ``z`` times ``(ray_x, ray_y, 1)``."""
+    px, py, pz = ray_x * z - pivot[0], ray_y * z - pivot[1], z - pivot[2]
+    sx, sy = fx / z, fy / z
+    motion[0, 0], motion[0, 2] = sx, -sx * ray_x
+    motion[1, 1], motion[1, 2] = sy, -sy * ray_y
+    motion[0, 3], motion[0, 4], motion[0, 5] = -sx * ray_x * py, sx * (pz + ray_x * px), -sx * py
+    motion[1, 3], motion[1, 4], motion[1, 5] = -sy * (pz + ray_y * py), sy * ray_y * px, sy * px
 
 
 @numba.njit(**OPTIONS)
@@ -364,7 +456,7 @@ def _of_outline(surface, target, buffers, pivot, scale, sums):
                 z = one / (at_begin + at_end)
                 ray_x = at_begin * x_cam[begin, 0] + at_end * x_cam[end, 0]
                 ray_y = at_begin * x_cam[begin, 1] + at_end * x_cam[end, 1]
-                point_motion(ray_x, ray_y, z, K[0, 0], K[1, 1], pivot, motion)
+                _point_motion(ray_x, ray_y, z, K[0, 0], K[1, 1], pivot, motion)
                 each = length / count
                 whole += each
                 squared = np.float64(residual) * residual
@@ -388,7 +480,7 @@ def _of_points(matches, R, t, K, scale, nearest, sums):
         gap_y = y / z * K[1, 1] + K[1, 2] - pixels[n, 1]
         squared = np.float64(gap_x) ** 2 + np.float64(gap_y) ** 2
         weight = 1 / (scale**2 + squared)
-        point_motion(x / z, y / z, z, K[0, 0], K[1, 1], t, motion)
+        _point_motion(x / z, y / z, z, K[0, 0], K[1, 1], t, motion)
         _add(sums, 1.0, 0.0, motion, weight, gap_x)
         _add(sums, 0.0, 1.0, motion, weight, gap_y)
         sums[6, 6] += math.log1p(squared / scale**2)
