@@ -96,7 +96,7 @@ def pose_normal_equations(
         weight = torch.ones_like(drawn.uv[:, 0])
     observed = observed.permute(0, 2, 3, 1)
     if use_numba(backend or drawn.backend, drawn.texture, drawn.screen, observed, weight):
-        from tracking3d.rendering.kernels.pose_terms import equations_of_pixels
+        from tracking3d.rendering.kernels.normal_equations import equations_of_pixels
 
         return NormalEquations(*equations_of_pixels(drawn, observed, pivot, scale, weight))
     batch, height, width = drawn.face_index.shape

@@ -51,10 +51,10 @@ _MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
     2.0,
 )  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
 _FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
-_VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted to the end (measured)
-_FIRST_STAGES = ((5, 1.0),)
-_FIRST_EVERY = 1
-_STAGES = ((8, True, 1, 9), (5, False, 1, 9))  # evaluations of the survivors, and whether at half resolution
+_VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted further (measured)
+# Evaluations, whether at half resolution, and how many survivors take part (measured: with five the same winners)
+_STAGES = ((8, True, 5), (5, False, 3))
+_COARSE_FACES = 3  # at half resolution, where a face has 1 to 2 pixels, one in so many is compared (measured)
 _LAST_EVALUATIONS = 5  # of the best one
 _VIEWS_AGAIN = 12  # keyframes from which a map is restarted (chosen)
 _CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best other rotation (chosen)
@@ -169,15 +169,15 @@ def initialize_without_points(
     def posed(name: str, poses: list[Pose]) -> _Fitted:
         return math.inf, replace(object_map, keyframes=_with_poses(chosen, poses)), name
 
-    tried = _fit_first(fit, [posed(*one) for one in rotation_hypotheses(chosen, camera)])
+    tried = fit([posed(*one) for one in rotation_hypotheses(chosen, camera)], _FIRST_EVALUATIONS, True)
     tried = _distinct(tried, _VARIED)
     varied = [
         posed(name, poses)
         for _, found, name in tried
         for poses in vary_rotations(chosen, [view.pose for view in found.keyframes], camera)
     ]
-    best, *_ = _fit_survivors(fit, [*tried, *_fit_first(fit, varied)])
-    ((_, found, name),) = fit([best], _LAST_EVALUATIONS, False, 1)
+    best, *_ = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True)])
+    ((_, found, name),) = fit([best], _LAST_EVALUATIONS, False)
     found = _without_points(found)
     fits = fit_keyframes(found)
     cost, overlap = (float(np.mean([getattr(one, part) for one in fits])) for part in ("cost", "overlap"))
@@ -207,16 +207,15 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     poses += continue_rotation(chosen, camera)
     blank = replace(object_map, vertices=object_map.shape.rest, free_axis=None)
     tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
-    (cost, found, _), *rivals = _fit_survivors(fit, _fit_first(fit, tried))
+    (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
     as_it_is = replace(object_map, keyframes=_with_poses(chosen, present), free_axis=None)
-    ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False, 1)
+    ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
     clear = cost < _CLEARLY_BETTER * min([before, *others])
     return _without_points(found) if clear else object_map
 
 
 _Fitted = tuple[float, ObjectMap, str]
-_Fit = Callable[[list[_Fitted], int, bool, int], list[_Fitted]]
 
 
 def _fit_hypotheses(
@@ -226,14 +225,12 @@ def _fit_hypotheses(
     tried: list[_Fitted],
     evaluations: int,
     coarse: bool,
-    every: int,
 ) -> list[_Fitted]:
     """Shape and poses of each hypothesis fitted to the views a little further, by rising cost."""
     fitted = []
     for _, hypothesis, name in tried:
-        found, cost = fit_jointly(
-            with_observations(hypothesis, views, coarse), modes, weights, evaluations, every
-        )
+        posed, every = with_observations(hypothesis, views, coarse), _COARSE_FACES if coarse else 1
+        found, cost = fit_jointly(posed, modes, weights, evaluations, every)
         fitted.append((cost + _MISSED * (1 - _mean_overlap(found)), found, name))
     return sorted(fitted, key=lambda one: one[0])
 
@@ -254,18 +251,13 @@ def _mean_overlap(object_map: ObjectMap) -> float:
     return float(np.mean(overlaps))
 
 
-def _fit_first(fit: _Fit, tried: list[_Fitted]) -> list[_Fitted]:
-    """Hypotheses fitted a little, by rising cost; those that are behind end early."""
-    for evaluations, share in _FIRST_STAGES:
-        tried = fit(tried[: math.ceil(share * len(tried))], evaluations, True, _FIRST_EVERY)
-    return tried
-
-
-def _fit_survivors(fit: _Fit, tried: list[_Fitted]) -> list[_Fitted]:
+def _fit_survivors(
+    fit: Callable[[list[_Fitted], int, bool], list[_Fitted]], tried: list[_Fitted]
+) -> list[_Fitted]:
     """The better hypotheses, fitted to the end, by rising cost."""
     tried = _distinct(tried, _SURVIVORS)
-    for evaluations, coarse, every, most in _STAGES:
-        tried = fit(tried[:most], evaluations, coarse, every)
+    for evaluations, coarse, most in _STAGES:
+        tried = fit(tried[:most], evaluations, coarse)
     return tried
 
 

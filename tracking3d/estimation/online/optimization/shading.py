@@ -86,7 +86,7 @@ def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float, ev
     ends, totals = np.zeros(len(faces) + 1, np.int64), np.zeros(2)
     radius = float(np.linalg.norm(x_cam[0] - x_cam[0].mean(0), axis=1).max())
     ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals, every) + 1]
-    sights = shading.Sights(*(one[: ends[-1]] for one in sights))
+    sights = shading.Sights._make(one[: ends[-1]] for one in sights)
     whole, light = max(totals[0], 1e-9), np.zeros((channels, 3))
     sights.weight[:] /= whole * channels
     loss = shading.shade(sights, ends, scale, _RIDGE / channels, light)
