@@ -438,7 +438,7 @@ def _turn_by_steps(views: list[Keyframe], steps: NDArray[np.float64], camera: Ca
 
 def _place_views(first: Keyframe, view: Keyframe, camera: Camera) -> torch.Tensor:
     """The first translation moved so that it projects to a view's mask."""
-    if first.mask is None or view.mask is None:
+    if first.mask is None or view.mask is None or not (first.mask.any() and view.mask.any()):
         return first.pose.translation
     one, other = (cv2.moments(mask.view(np.uint8), binaryImage=True) for mask in (first.mask, view.mask))
     x0, y0, x1, y1 = (moments[part] / moments["m00"] for moments in (one, other) for part in ("m10", "m01"))
