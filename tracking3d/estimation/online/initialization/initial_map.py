@@ -50,9 +50,7 @@ _MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
     6,
     2.0,
 )  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
-# Evaluations of each hypothesis, at half resolution, where a face has 1 to 2 pixels: one in so many is compared (with
-# every second one, costs of starts stay within 3 %, with every third one a phone clip's rise by a sixth; measured)
-_FIRST_EVALUATIONS, _FIRST_FACES = 5, 2
+_FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
 _VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted further (measured)
 # Evaluations, whether at half resolution, and how many survivors take part (measured: with five the same winners)
 _STAGES = ((8, True, 5), (5, False, 3))
@@ -170,16 +168,14 @@ def initialize_without_points(
     def posed(name: str, poses: list[Pose]) -> _Fitted:
         return math.inf, replace(object_map, keyframes=_with_poses(chosen, poses)), name
 
-    tried = fit(
-        [posed(*one) for one in rotation_hypotheses(chosen, camera)], _FIRST_EVALUATIONS, True, _FIRST_FACES
-    )
+    tried = fit([posed(*one) for one in rotation_hypotheses(chosen, camera)], _FIRST_EVALUATIONS, True)
     tried = _distinct(tried, _VARIED)
     varied = [
         posed(name, poses)
         for _, found, name in tried
         for poses in vary_rotations(chosen, [view.pose for view in found.keyframes], camera)
     ]
-    best, *_ = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True, _FIRST_FACES)])
+    best, *_ = _fit_survivors(fit, [*tried, *fit(varied, _FIRST_EVALUATIONS, True)])
     ((_, found, name),) = fit([best], _LAST_EVALUATIONS, False)
     found = _without_points(found)
     fits = fit_keyframes(found)
@@ -210,7 +206,7 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     poses += continue_rotation(chosen, camera)
     blank = replace(object_map, vertices=object_map.shape.rest, free_axis=None)
     tried = [(math.inf, replace(blank, keyframes=_with_poses(chosen, one)), "") for one in poses]
-    (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True, _FIRST_FACES))
+    (cost, found, _), *rivals = _fit_survivors(fit, fit(tried, _FIRST_EVALUATIONS, True))
     as_it_is = replace(object_map, keyframes=_with_poses(chosen, present), free_axis=None)
     ((before, _, _),) = fit([(math.inf, as_it_is, "")], _LAST_EVALUATIONS, False)
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
@@ -228,13 +224,12 @@ def _fit_hypotheses(
     tried: list[_Fitted],
     evaluations: int,
     coarse: bool,
-    every: int = 1,
 ) -> list[_Fitted]:
-    """Shape and poses of each hypothesis fitted to the views a little further, by rising cost; see `fit_jointly`."""
+    """Shape and poses of each hypothesis fitted to the views a little further, by rising cost."""
     fitted = []
     for _, hypothesis, name in tried:
         posed = with_observations(hypothesis, views, coarse)
-        found, cost = fit_jointly(posed, modes, weights, evaluations, every)
+        found, cost = fit_jointly(posed, modes, weights, evaluations)
         fitted.append((cost + _MISSED * (1 - _mean_overlap(found)), found, name))
     return sorted(fitted, key=lambda one: one[0])
 

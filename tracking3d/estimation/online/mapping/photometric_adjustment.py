@@ -57,7 +57,6 @@ class _Problem:
     mask_weight: Tensor  # (B,) how far each mask is trusted
     # (3 M, N) the shape unknowns for each change of the profile of a surface of revolution; None: all are free
     tied: Tensor | None = None
-    every: int = 1  # of the faces one in so many is compared
 
     @property
     def size(self) -> int:
@@ -98,7 +97,7 @@ class _Equations:
 
 
 def fit_jointly(
-    object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights, iterations: int, every: int = 1
+    object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights, iterations: int
 ) -> tuple[ObjectMap, float]:
     """The map with vertices and keyframe poses, except the first, that explain its keyframes better; their cost.
 
@@ -107,12 +106,11 @@ def fit_jointly(
         modes: The basis of the shape's offsets.
         weights: The weights of outline and smoothness.
         iterations: The most evaluations after the first.
-        every: Of the faces one in so many is compared.
     """
     axis, tied = object_map.free_axis, None
     if axis is not None:
         modes, tied = axis.basis(object_map.vertices)
-    problem = replace(_problem(object_map, modes, weights), tied=tied, every=every)
+    problem = replace(_problem(object_map, modes, weights), tied=tied)
     free = torch.ones(problem.unknowns, dtype=torch.bool)
     if axis is None:
         free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
@@ -221,7 +219,7 @@ def _evaluate(problem: _Problem, vertices: Tensor, R: Tensor, t: Tensor) -> _Sta
         vertices, object_map.shape.faces, object_map.shape.face_uvs, vertices.new_zeros(1, 8, 8), R, t, problem.K,
         (problem.size, problem.size), backend=object_map.renderer,
     )  # fmt: skip
-    faces = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE, problem.every)
+    faces = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE)
     outlines, outline_cost = _outlines(problem, drawn)
     stiffness, offsets = _bending(problem, vertices)
     cost = _APPEARANCE * faces.cost + outline_cost + float((stiffness * offsets.square()).sum())

@@ -63,14 +63,13 @@ def layers_of(features: Tensor, valid: Tensor) -> NDArray[np.float32]:
     return layers.contiguous().cpu().float().numpy()
 
 
-def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float, every: int = 1) -> SharedFaces:
+def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float) -> SharedFaces:
     """What the views show of the same faces at the present shape and poses.
 
     Args:
         drawn: The rendering.
         layers: From `layers_of`.
         scale: Difference of features at which the loss is ``log 2``.
-        every: Only each so many faces are compared.
     """
     from tracking3d.estimation.online.optimization.kernels import shading
 
@@ -85,7 +84,7 @@ def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float, ev
     )  # fmt: skip
     ends, totals = np.zeros(len(faces) + 1, np.int64), np.zeros(2)
     radius = float(np.linalg.norm(x_cam[0] - x_cam[0].mean(0), axis=1).max())
-    ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals, every) + 1]
+    ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals) + 1]
     sights = shading.Sights._make(one[: ends[-1]] for one in sights)
     whole, light = max(totals[0], 1e-9), np.zeros((channels, 3))
     sights.weight[:] /= whole * channels

@@ -48,18 +48,15 @@ _SIGHTS = record(
 _SUMS = types.Tuple((int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]))
 
 
-@kernel(int64(_DRAWN, float32[:, :, :, ::1], float64, _SIGHTS, int64[::1], float64[::1], int64))
-def find_sights(drawn, layers, radius, sights, ends, totals, every):
-    """Write the sights of each face, where each face's end, and the weights of all and of these; how many faces.
-
-    Every so many faces are taken.
-    """
+@kernel(int64(_DRAWN, float32[:, :, :, ::1], float64, _SIGHTS, int64[::1], float64[::1]))
+def find_sights(drawn, layers, radius, sights, ends, totals):
+    """Write the sights of each face, where each face's end, and the weights of all and of these; how many faces."""
     face_of, view_of, normals, values, weights, _, _ = sights
     x_cam, screen, depth, K, faces = drawn
     size, count = depth.shape[1], layers.shape[3]
     corner, normal, sampled = np.empty((3, 3)), np.empty(3), np.empty(count)
     last, found = 0, 0
-    for face in range(0, len(faces), every):
+    for face in range(len(faces)):
         a, b, c = faces[face]
         first, largest = last, 0.0
         for view in range(len(x_cam)):
