@@ -43,9 +43,12 @@ class Contour:
     frames: int  # B
 
 
-def find_contour(drawn: Rendering) -> Contour:
-    """The contour of every frame's silhouette; parts of it outside the window are left out."""
-    view, begin, end = _contour_edges(drawn)
+def find_contour(drawn: Rendering, edges: tuple[Tensor, Tensor] | None = None) -> Contour:
+    """The contour of every frame's silhouette; parts of it outside the window are left out.
+
+    The ``edges`` are those of the faces, by `edges_of`; they are found if None.
+    """
+    view, begin, end = _contour_edges(drawn, edges or edges_of(drawn.faces))
     along = drawn.screen[view, end] - drawn.screen[view, begin]
     length = along.detach().norm(dim=1)
     count = length.ceil().clamp(1, MOST_ON_AN_EDGE).long()
@@ -144,12 +147,11 @@ def signed_distance(mask: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _contour_edges(drawn: Rendering) -> tuple[Tensor, Tensor, Tensor]:
+def _contour_edges(drawn: Rendering, edges: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """View, first and second vertex of the edges between front and back, as front faces go around them."""
     faces = drawn.faces
     start, end = faces.reshape(-1), faces.roll(-1, 1).reshape(-1)
-    edge, shared = edges_of(faces)
-    edge = edge.reshape(-1)
+    edge, shared = edges[0].reshape(-1), edges[1]
     in_front = (drawn.x_cam[..., 2] > NEAR)[:, faces].all(2)
     front = front_faces(drawn.screen, faces) & in_front
     sides = front.repeat_interleave(3, 1)  # (B, 3 F), in the order of `edge`

@@ -94,16 +94,16 @@ def pose_normal_equations(
     )
     if weight is None:
         weight = torch.ones_like(drawn.uv[:, 0])
-    rows = observed.permute(0, 2, 3, 1).reshape(-1, observed.shape[1])
+    observed = observed.permute(0, 2, 3, 1)
     if use_numba(backend or drawn.backend, drawn.texture, drawn.screen, observed, weight):
-        from tracking3d.rendering.kernels.normal_equations import accumulate
+        from tracking3d.rendering.kernels.normal_equations import equations_of_pixels
 
-        return NormalEquations(*accumulate(drawn, rows, pivot, scale, weight))
+        return NormalEquations(*equations_of_pixels(drawn, observed, pivot, scale, weight))
     batch, height, width = drawn.face_index.shape
     view = torch.div(drawn.pixels, height * width, rounding_mode="floor")
     uv_by_x, uv_by_y, depth = _surface_at_pixels(drawn, view)
     value, by_u, by_v = bilinear_taps(drawn.texture, drawn.uv)
-    target = rows.index_select(0, drawn.pixels)
+    target = observed.reshape(-1, observed.shape[3]).index_select(0, drawn.pixels)
     residual = value - target
     # Slopes of the rendered image by x and y, (2, P, C); the Jacobian has the opposite sign.
     slopes = torch.stack([uv[:, :1] * by_u + uv[:, 1:] * by_v for uv in (uv_by_x, uv_by_y)])

@@ -9,19 +9,19 @@ import trimesh
 from scipy.sparse.linalg import eigsh
 from torch import Tensor
 from turned_solid import LAMP, SIZE, degrees_apart, turned, turned_map
+from twins import shading as twin
 
 from tracking3d.estimation.online.mapping.photometric_adjustment import (
+    _APPEARANCE_SCALE,
+    _evaluate,
+    _problem,
+    _State,
     fit_jointly,
     refine_without_points,
 )
 from tracking3d.estimation.online.optimization import shape_basis
-from tracking3d.estimation.online.optimization.shading import (
-    SharedFaces,
-    _shade,
-    face_equations,
-    layers_of,
-    shared_faces,
-)
+from tracking3d.estimation.online.optimization.kernels.shading import Sights, shade
+from tracking3d.estimation.online.optimization.shading import normal_equations
 from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
@@ -50,25 +50,17 @@ def errors(object_map: ObjectMap, angles: list[float] = ANGLES) -> list[float]:
     ]
 
 
-def shared(object_map: ObjectMap) -> tuple[SharedFaces, Pose]:
+def evaluated(object_map: ObjectMap, count: int = 20) -> tuple[_State, ShapeBasis]:
+    modes = ShapeBasis.of(object_map.shape, count)
     poses = Pose.stack([view.pose for view in object_map.keyframes])
-    observations = [view.observation for view in object_map.keyframes]
-    K = torch.stack([o.K for o in observations])
-    layers = layers_of(
-        torch.stack([o.features for o in observations]), torch.stack([o.mask for o in observations])
-    )
-    shape = object_map.shape
-    drawn = render(
-        object_map.vertices,
-        shape.faces,
-        shape.face_uvs,
-        torch.zeros(1, 8, 8),
-        poses.R,
-        poses.translation,
-        K,
-        (SIZE, SIZE),
-    )
-    return shared_faces(drawn, layers, 0.25), poses
+    problem = _problem(object_map, modes, WEIGHTS)
+    return _evaluate(problem, object_map.vertices, poses.R, poses.translation), modes
+
+
+def equations(object_map: ObjectMap, factor: float = 1.0) -> tuple[Tensor, Tensor]:
+    state, modes = evaluated(object_map)
+    matrix, gradient = normal_equations(state.faces, state.outlines, factor, state.R, state.t, modes)
+    return torch.from_numpy(matrix), torch.from_numpy(gradient)
 
 
 def surface_distance(vertices: Tensor, truth: ObjectMap) -> float:
@@ -114,45 +106,82 @@ def test_the_modes_do_not_depend_on_which_basis_the_eigensolver_finds(monkeypatc
 
 
 def test_the_light_of_flat_colours_is_found_exactly() -> None:
-    generator = torch.Generator().manual_seed(1)
-    normal = torch.nn.functional.normalize(torch.randn(300, 4, 3, generator=generator), dim=2)
-    colour = torch.rand(300, 1, 3, generator=generator)
-    light, residual, _ = _shade(colour + normal @ LAMP.T, normal, torch.full((300, 4, 3), 1 / 3600), 0.25)
-    assert torch.allclose(light, LAMP, atol=0.02)
-    assert float(residual.abs().mean()) < 0.01
+    random = np.random.default_rng(1)
+    normal = random.standard_normal((300, 4, 3))
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    values = random.random((300, 1, 3)) + normal @ LAMP.double().numpy().T
+    rows, nothing = np.arange(1200), np.empty((1200, 3))
+    slopes = np.zeros((1200, 6))
+    sights = Sights(
+        rows // 4, rows % 4, normal.reshape(-1, 3), np.concatenate([values.reshape(-1, 3), slopes], 1),
+        np.full(1200, 1 / 3600), nothing, nothing.copy(),
+    )  # fmt: skip
+    light = np.empty((3, 3))
+    loss = shade(sights, np.arange(0, 1201, 4), 0.25, 1e-3 / 3, light)
+    assert np.allclose(light, LAMP, atol=0.02)
+    assert np.abs(sights.residual).mean() < 0.01
+    assert loss < 1e-3
+
+
+@pytest.mark.parametrize("degrees", [0.0, 5.0, 25.0])
+@pytest.mark.parametrize("lit", [True, False])
+def test_the_kernels_say_what_the_slow_twin_says(degrees: float, lit: bool) -> None:
+    object_map = disturbed(turned_map(ANGLES, lit=lit), degrees)
+    state, modes = evaluated(object_map)
+    problem, shape = _problem(object_map, modes, WEIGHTS), object_map.shape
+    drawn = render(
+        object_map.vertices, shape.faces, shape.face_uvs, torch.zeros(1, 8, 8), state.R, state.t, problem.K,
+        (SIZE, SIZE),
+    )  # fmt: skip
+    layers = torch.from_numpy(problem.layers).permute(0, 3, 1, 2)
+    expected = twin.shared_faces(drawn, layers, _APPEARANCE_SCALE)
+    assert np.array_equal(np.unique(state.faces.sights.face), expected.faces)
+    assert state.faces.cost == pytest.approx(expected.cost, rel=1e-4)
+    assert np.allclose(state.faces.light, expected.light, atol=1e-4)
+    matrix, gradient = normal_equations(state.faces, state.outlines, 4.0, state.R, state.t, modes)
+    slow, slope = twin.normal_equations(
+        expected, state.outlines, 4.0, state.R, state.t, modes, object_map.shape.faces
+    )
+    assert np.allclose(matrix, slow, rtol=0, atol=1e-5 * float(slow.abs().max()))
+    assert np.allclose(gradient, slope, rtol=0, atol=1e-4 * float(slope.abs().max()))
 
 
 def test_moving_the_object_is_moving_all_views() -> None:
     # An exact property of the derivatives: both sides are the same motion on every screen.
-    shown, poses = shared(disturbed(turned_map(ANGLES), 5.0))
-    found = face_equations(shown, poses.R, poses.translation)
-    by_view = found.by_rest[: 6 * len(ANGLES)].reshape(-1, 2, 3)
-    by_shift = found.by_corners.reshape(-1, 3, 3).sum((0, 1))
-    by_views = torch.einsum("bij,bi->j", poses.R, by_view[:, 0])
+    object_map = disturbed(turned_map(ANGLES), 5.0)
+    state, modes = evaluated(object_map)
+    _, gradient = equations(object_map)
+    count = 3 * len(modes.bending)
+    by_view = gradient[count : count + 6 * len(ANGLES)].reshape(-1, 2, 3)
+    by_shift = gradient[:3] / modes.vectors[0, 0]  # the lowest mode is the same at all vertices
+    by_views = torch.einsum("bij,bi->j", state.R.double(), by_view[:, 0])
     assert float(by_shift.norm()) > 1e-3
     assert torch.allclose(by_shift, by_views, atol=1e-3 * float(by_shift.norm()))
 
 
 def test_the_cost_falls_along_the_gradient_by_about_as_much_as_it_says() -> None:
     object_map = disturbed(turned_map(ANGLES, lit=False), 4.0)
-    found, poses = shared(object_map)
-    gradient = face_equations(found, poses.R, poses.translation).by_rest[6:12]
+    state, modes = evaluated(object_map)
+    _, gradient = equations(object_map)
+    _, outlines = equations(object_map, 0.0)
+    count = 3 * len(modes.bending)
+    gradient = (gradient - outlines)[count + 6 : count + 12].float()
     step = -0.01 * gradient / gradient.norm()
     view = object_map.keyframes[1]
     R = rotation_about(step[3:], float(torch.rad2deg(step[3:].norm()))) @ view.pose.R
     moved = replace(view, pose=from_matrix(R, view.pose.translation + step[:3]))
-    after, _ = shared(
+    after, _ = evaluated(
         replace(object_map, keyframes=(object_map.keyframes[0], moved, *object_map.keyframes[2:]))
     )
     # Not exactly: which faces are seen, and how large, changes too.
-    assert 0.5 < (found.cost - after.cost) / (0.01 * float(gradient.norm())) < 2.0
+    assert 0.5 < (state.faces.cost - after.faces.cost) / (0.01 * float(gradient.norm())) < 2.0
 
 
 def test_a_lit_and_turning_solid_costs_next_to_nothing_at_the_truth() -> None:
-    plain, _ = shared(turned_map(ANGLES, textured=False))
-    dark, _ = shared(turned_map(ANGLES, textured=False, lit=False))
-    assert plain.cost < 0.05
-    assert dark.cost < 0.05
+    plain, _ = evaluated(turned_map(ANGLES, textured=False))
+    dark, _ = evaluated(turned_map(ANGLES, textured=False, lit=False))
+    assert plain.faces.cost < 0.05
+    assert dark.faces.cost < 0.05
 
 
 @pytest.mark.parametrize("count", [40, 80])

@@ -56,8 +56,9 @@ def test_translations_follow_the_masks() -> None:
     # Half as wide is twice as far away.
     views[1] = replace(second, mask=box_mask(24, 24, 8))
     assert float(rotation_hypotheses(views, CAMERA)[0][1][1].translation[2]) == pytest.approx(2 * depth)
-    views[1] = replace(second, mask=None)
-    assert torch.equal(rotation_hypotheses(views, CAMERA)[0][1][1].translation, first.pose.translation)
+    for nothing in (None, box_mask(0, 0, 0)):
+        views[1] = replace(second, mask=nothing)
+        assert torch.equal(rotation_hypotheses(views, CAMERA)[0][1][1].translation, first.pose.translation)
 
 
 def test_a_start_without_points_begins_where_the_object_is_by_then(monkeypatch) -> None:

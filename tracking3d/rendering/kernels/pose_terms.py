@@ -17,44 +17,29 @@ from tracking3d.geometry.camera import NEAR
 from tracking3d.rendering.contour import MOST_ON_AN_EDGE, PROBE
 from tracking3d.rendering.kernels.compilation import (
     OPTIONS,
-    REORDER,
     array,
     check_corners,
     kernel,
     record,
     share,
 )
-from tracking3d.rendering.kernels.interpolation import barycentrics, slopes_of_face
-from tracking3d.rendering.kernels.normal_equations import of_channels, point_motion
-from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
+from tracking3d.rendering.kernels.normal_equations import (
+    COMPARABLE,
+    KNOWN,
+    SURFACE,
+    DrawingBuffers,
+    SurfaceArrays,
+    TargetArrays,
+    finish,
+    of_pixels,
+    point_motion,
+)
 from tracking3d.rendering.kernels.visibility import draw_view
 from tracking3d.rendering.normal_equations import NormalEquations
 from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
 from tracking3d.rendering.surface import Surface
 
 # mypy: disable-error-code="no-untyped-def"
-
-
-class SurfaceArrays(NamedTuple):
-    """An object as `tracking3d.rendering.surface.Surface` has it."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    face_uvs: NDArray[np.float32]
-    edges: NDArray[np.int64]
-    faces_of_edge: NDArray[np.int64]
-    layers: NDArray[np.float32]
-
-
-class TargetArrays(NamedTuple):
-    """A frame as `PoseTarget` has it, features ``(S, S, C)``; what it does not have is empty."""
-
-    features: NDArray[np.float32]
-    comparable: NDArray[np.float32]
-    inside: NDArray[np.bool_]
-    mask: NDArray[np.bool_]
-    distance: NDArray[np.float32]
-    K: NDArray[np.float32]
 
 
 class MatchArrays(NamedTuple):
@@ -73,26 +58,6 @@ class LossScales(NamedTuple):
     nearest: float
 
 
-class DrawingBuffers(NamedTuple):
-    """What `terms_of_pose` writes on its way, to be used again.
-
-    Attributes:
-        x_cam: ``(V, 3)`` vertices in the camera, and
-        screen: ``(V, 2)`` on the screen.
-        face_index: ``(S, S)`` faces, and
-        inverse_depth: ``(S, S)`` of what is drawn.
-    """
-
-    x_cam: NDArray[np.float32]
-    screen: NDArray[np.float32]
-    face_index: NDArray[np.int64]
-    inverse_depth: NDArray[np.float32]
-
-
-SURFACE = record(
-    SurfaceArrays,
-    float32[:, ::1], int64[:, ::1], float32[:, :, ::1], int64[:, ::1], int64[::1], float32[:, :, ::1],
-)  # fmt: skip
 TARGET = record(
     TargetArrays,
     float32[:, :, ::1], float32[:, ::1], boolean[:, ::1], boolean[:, ::1], float32[:, ::1], float32[:, ::1],
@@ -141,8 +106,8 @@ def drawing_buffers(vertices, comparable):
 
 APPEARANCE, OUTLINE, POINTS = range(3)
 """Places of the terms in the sums: each has its matrix, below it its gradient, and in the corner its cost."""
-COMPARABLE, KNOWN, BOTH, EITHER = range(4)
-"""Places of what is counted: see `PoseTerms`; pixels in the silhouette and the mask, and in either."""
+BOTH, EITHER = 2, 3
+"""Places of what is counted after those of `of_pixels`: pixels in the silhouette and the mask, and in either."""
 
 
 def pose_terms(
@@ -163,11 +128,11 @@ def pose_terms(
         for term in torch.from_numpy(sums).unbind(1)
     )
     appearance, outline, by_points = models
-    of_pixels = torch.from_numpy(counts)
-    overlap = of_pixels[:, BOTH] / of_pixels[:, EITHER].clamp_min(1)
+    counted = torch.from_numpy(counts)
+    overlap = counted[:, BOTH] / counted[:, EITHER].clamp_min(1)
     if target.mask is None:
         overlap = torch.ones_like(overlap)
-    return PoseTerms(appearance, outline, by_points, of_pixels[:, COMPARABLE], of_pixels[:, KNOWN], overlap)
+    return PoseTerms(appearance, outline, by_points, counted[:, COMPARABLE], counted[:, KNOWN], overlap)
 
 
 @kernel(
@@ -191,7 +156,7 @@ def terms_of_pose(surface, target, matches, R, t, scales, buffers, sums, counts)
     face_index[:] = -1
     inverse_depth[:] = 0
     draw_view(screen, depth, surface.faces, np.float32(NEAR), face_index, inverse_depth)
-    _of_pixels(surface, target, buffers, depth, t, scales.appearance, sums[APPEARANCE], counts)
+    of_pixels(surface, target, buffers, depth, t, scales.appearance, sums[APPEARANCE], counts)
     if target.mask.size:
         _count_overlap(face_index, target.inside, target.mask, counts)
     if target.distance.size:
@@ -219,84 +184,6 @@ def _count_overlap(face_index, inside, mask, counts):
                 covered = face_index[y, x] >= 0
                 counts[BOTH] += covered and mask[y, x]
                 counts[EITHER] += covered or mask[y, x]
-
-
-@numba.njit(fastmath=REORDER, **OPTIONS)
-def _of_pixels(surface, target, buffers, depth, pivot, scale, sums, counts):
-    """Mean loss of the features over the covered pixels; see `tracking3d.rendering.kernels.normal_equations`."""
-    faces, face_uvs, layers = surface.faces, surface.face_uvs, surface.layers
-    features, comparable, K = target.features, target.comparable, target.K
-    screen, face_index, inverse_depth = buffers.screen, buffers.face_index, buffers.inverse_depth
-    height, width, channels = layers.shape[0], layers.shape[1], layers.shape[2] - 1
-    rows, columns = face_index.shape
-    one = np.float32(1)
-    sharpness = np.float32(1 / scale**2)
-    fx, cx, fy, cy = K[0, 0], K[0, 2], K[1, 1], K[1, 2]
-    motion = np.zeros((2, 6), np.float32)
-    total = 0.0
-    for y in range(rows):
-        x = 0
-        while x < columns:
-            face = face_index[y, x]
-            if face < 0:
-                x += 1
-                continue
-            a, b, c = faces[face]
-            place, slope_x, slope_y, inverse = slopes_of_face(screen, depth, a, b, c)
-            uv = face_uvs[face]
-            while x < columns and face_index[y, x] == face:
-                column = x
-                x += 1
-                counts[COMPARABLE] += comparable[y, column]
-                if comparable[y, column] == 0:
-                    continue
-                wa, wb, wc = barycentrics(place, slope_x, slope_y, np.float32(column), np.float32(y))
-                wa, wb, wc = wa * inverse[0], wb * inverse[1], wc * inverse[2]
-                s = one / (wa + wb + wc)
-                u = (wa * uv[0, 0] + wb * uv[1, 0] + wc * uv[2, 0]) * s
-                v = (wa * uv[0, 1] + wb * uv[1, 1] + wc * uv[2, 1]) * s
-                taps = taps_of(u, v, height, width)
-                w00, w01, w10, w11 = bilinear_weights(taps)
-                t00, t01, t10, t11 = texels_at(layers, taps)
-                seen = w00 * t00[channels] + w01 * t01[channels] + w10 * t10[channels] + w11 * t11[channels]
-                weight = np.float64(seen * comparable[y, column])
-                if weight == 0:
-                    continue
-                total += weight
-                ua, va, ub, vb = uv[0, 0] - u, uv[0, 1] - v, uv[1, 0] - u, uv[1, 1] - v
-                uc, vc = uv[2, 0] - u, uv[2, 1] - v
-                xa, xb, xc = slope_x[0] * inverse[0], slope_x[1] * inverse[1], slope_x[2] * inverse[2]
-                ya, yb, yc = slope_y[0] * inverse[0], slope_y[1] * inverse[1], slope_y[2] * inverse[2]
-                z = one / inverse_depth[y, column]
-                texels_u, texels_v = z * np.float32(width), z * np.float32(height)
-                by_x = (xa * ua + xb * ub + xc * uc) * texels_u, (xa * va + xb * vb + xc * vc) * texels_v
-                by_y = (ya * ua + yb * ub + yc * uc) * texels_u, (ya * va + yb * vb + yc * vc) * texels_v
-                xx, xy, yy, gx, gy, loss = of_channels(
-                    layers, taps, features[y, column], channels, sharpness, by_x, by_y
-                )
-                ray_x, ray_y = (np.float32(column) - cx) / fx, (np.float32(y) - cy) / fy
-                point_motion(ray_x, ray_y, z, fx, fy, pivot, motion)
-                for i in range(6):
-                    left_x = weight * (xx * motion[0, i] + xy * motion[1, i])
-                    left_y = weight * (xy * motion[0, i] + yy * motion[1, i])
-                    for j in range(i, 6):
-                        sums[i, j] += left_x * motion[0, j] + left_y * motion[1, j]
-                    # At a fixed pixel the rendered image moves against the surface.
-                    sums[6, i] -= weight * (gx * motion[0, i] + gy * motion[1, i])
-                sums[6, 6] += weight * loss
-    counts[KNOWN] = total
-    _finish(sums, max(total, 1.0) * channels)
-
-
-@numba.njit(**OPTIONS)
-def _finish(sums, total):
-    """Means of sums: the upper triangle and the gradient are halves of what they stand for."""
-    for i in range(6):
-        sums[6, i] *= 2 / total
-        for j in range(i, 6):
-            sums[i, j] *= 2 / total
-            sums[j, i] = sums[i, j]
-    sums[6, 6] /= total
 
 
 @numba.njit(inline="always", **OPTIONS)
@@ -371,7 +258,7 @@ def _of_outline(surface, target, buffers, pivot, scale, sums):
                 weight = each / (scale**2 + squared)
                 _add(sums, d01 - d00 + fy * twist, d10 - d00 + fx * twist, motion, weight, residual)
                 sums[6, 6] += each * math.log1p(squared / scale**2)
-    _finish(sums, max(whole, 1.0))
+    finish(sums, max(whole, 1.0))
 
 
 @numba.njit(**OPTIONS)
@@ -392,4 +279,4 @@ def _of_points(matches, R, t, K, scale, nearest, sums):
         _add(sums, 1.0, 0.0, motion, weight, gap_x)
         _add(sums, 0.0, 1.0, motion, weight, gap_y)
         sums[6, 6] += math.log1p(squared / scale**2)
-    _finish(sums, len(points))
+    finish(sums, len(points))

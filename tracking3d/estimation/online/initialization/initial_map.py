@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.feature_space import FeatureSpace
-from tracking3d.estimation.observation import downsample
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.initialization.structure_from_motion import structure_hypotheses
@@ -38,6 +37,7 @@ from tracking3d.geometry.pose import (
     rotation_angle,
 )
 from tracking3d.points.bundle_adjustment.adjustment import Structure
+from tracking3d.rendering import project, rasterize
 
 _VIEWS = 8
 _ROTATION_FRAMES = (
@@ -51,8 +51,9 @@ _MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
     2.0,
 )  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
 _FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
-_VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted to the end (measured)
-_STAGES = ((8, True), (5, False))  # evaluations of the survivors, and whether at half resolution
+_VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted further (measured)
+# Evaluations, whether at half resolution, and how many survivors take part (measured: with five the same winners)
+_STAGES = ((8, True, 5), (5, False, 3))
 _LAST_EVALUATIONS = 5  # of the best one
 _VIEWS_AGAIN = 12  # keyframes from which a map is restarted (chosen)
 _CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best other rotation (chosen)
@@ -131,7 +132,7 @@ def _likely_structures(solved: list[_Solved]) -> list[_Solved]:
 def with_observations(object_map: ObjectMap, views: list[Keyframe], coarse: bool) -> ObjectMap:
     """The map with its views at full or half resolution."""
     keyframes = [
-        replace(posed, observation=downsample(view.observation) if coarse else view.observation, texture=None)
+        replace(posed, observation=view.observation.half if coarse else view.observation, texture=None)
         for posed, view in zip(object_map.keyframes, views, strict=True)
     ]
     return replace(object_map, keyframes=tuple(keyframes))
@@ -227,10 +228,26 @@ def _fit_hypotheses(
     """Shape and poses of each hypothesis fitted to the views a little further, by rising cost."""
     fitted = []
     for _, hypothesis, name in tried:
-        found, cost = fit_jointly(with_observations(hypothesis, views, coarse), modes, weights, evaluations)
-        missed = 1 - float(np.mean([fit.overlap for fit in fit_keyframes(found)]))
-        fitted.append((cost + _MISSED * missed, found, name))
+        posed = with_observations(hypothesis, views, coarse)
+        found, cost = fit_jointly(posed, modes, weights, evaluations)
+        fitted.append((cost + _MISSED * (1 - _mean_overlap(found)), found, name))
     return sorted(fitted, key=lambda one: one[0])
+
+
+def _mean_overlap(object_map: ObjectMap) -> float:
+    """Mean IoU of the silhouettes with the masks, as in `PoseFit`."""
+    targets = [view.observation.target for view in object_map.keyframes]
+    poses = Pose.stack([view.pose for view in object_map.keyframes])
+    K, size = torch.stack([target.K for target in targets]), targets[0].inside.shape
+    screen, depth = project(object_map.vertices, poses.R, poses.translation, K)
+    drawn = rasterize(screen, depth, object_map.shape.faces, (size[0], size[1]), object_map.renderer)
+    overlaps = [
+        1.0 if target.mask is None
+        else int((covered & target.mask)[target.inside].sum())
+        / max(int((covered | target.mask)[target.inside].sum()), 1)
+        for covered, target in zip(drawn.face_index >= 0, targets, strict=True)
+    ]  # fmt: skip
+    return float(np.mean(overlaps))
 
 
 def _fit_survivors(
@@ -238,8 +255,8 @@ def _fit_survivors(
 ) -> list[_Fitted]:
     """The better hypotheses, fitted to the end, by rising cost."""
     tried = _distinct(tried, _SURVIVORS)
-    for evaluations, coarse in _STAGES:
-        tried = fit(tried, evaluations, coarse)
+    for evaluations, coarse, most in _STAGES:
+        tried = fit(tried[:most], evaluations, coarse)
     return tried
 
 
@@ -420,10 +437,11 @@ def _turn_by_steps(views: list[Keyframe], steps: NDArray[np.float64], camera: Ca
 
 def _place_views(first: Keyframe, view: Keyframe, camera: Camera) -> torch.Tensor:
     """The first translation moved so that it projects to a view's mask."""
-    if first.mask is None or view.mask is None:
+    if first.mask is None or view.mask is None or not (first.mask.any() and view.mask.any()):
         return first.pose.translation
-    (x0, y0), (x1, y1) = (np.argwhere(mask)[:, ::-1].mean(0) for mask in (first.mask, view.mask))
-    ratio = float(np.clip(math.sqrt(first.mask.sum() / view.mask.sum()), 0.5, 2.0))
+    one, other = (cv2.moments(mask.view(np.uint8), binaryImage=True) for mask in (first.mask, view.mask))
+    x0, y0, x1, y1 = (moments[part] / moments["m00"] for moments in (one, other) for part in ("m10", "m01"))
+    ratio = float(np.clip(math.sqrt(one["m00"] / other["m00"]), 0.5, 2.0))
     depth = float(first.pose.translation[2])
     shift = first.pose.translation.new_tensor(
         [(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0]

@@ -1,6 +1,6 @@
 """Joint adjustment of shape and poses of some views, for objects without points.
 
-Levenberg-Marquardt on the photometric differences of shared faces (`face_equations`), on the outlines' signed
+Levenberg-Marquardt on the photometric differences of shared faces (`normal_equations`), on the outlines' signed
 distances, and on the Laplacian of the shape's offsets. The shape moves in the lowest modes of its Laplacian, so that
 all unknowns form one small dense system. The first pose is fixed. If the map has a free axis, its surface stays one of
 revolution: the shape moves by its profile, and the axis is fixed in place of the first pose.
@@ -10,23 +10,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.online.optimization.shading import (
+    OutlineResiduals,
     SharedFaces,
-    face_equations,
     layers_of,
+    normal_equations,
     shared_faces,
 )
-from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis, project_on_basis
+from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.shape import flatten, unfold
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
-from tracking3d.rendering import Contour, Rendering, find_contour, render
+from tracking3d.rendering import Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
-from tracking3d.rendering.normal_equations import screen_motion
+from tracking3d.rendering.surface import edges_of
 
 _APPEARANCE = 4.0  # weight of the mean photometric loss
 _APPEARANCE_SCALE = 0.25
@@ -48,7 +51,8 @@ class _Problem:
     modes: ShapeBasis
     weights: FitWeights
     K: Tensor  # (B, 3, 3) of the windows
-    layers: Tensor  # see `layers_of`
+    layers: NDArray[np.float32]  # see `layers_of`
+    edges: tuple[Tensor, Tensor]  # of the faces, see `edges_of`
     distance: Tensor  # (B, S, S) to the masks' outlines, pixels of the window
     mask_weight: Tensor  # (B,) how far each mask is trusted
     # (3 M, N) the shape unknowns for each change of the profile of a surface of revolution; None: all are free
@@ -67,19 +71,7 @@ class _Problem:
     @property
     def unknowns(self) -> int:
         """The number of all unknowns."""
-        channels = (self.layers.shape[1] - 1) // 3
-        return self.shape_unknowns + 6 * len(self.K) + 3 * channels
-
-
-@dataclass(frozen=True, eq=False)
-class _Outlines:
-    """The rendered outlines: distances from the masks' in pixels, gradients, weights, and the cost."""
-
-    contour: Contour
-    residual: Tensor
-    slope: Tensor
-    weight: Tensor
-    cost: float
+        return self.shape_unknowns + 6 * len(self.K) + self.layers.shape[3] - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +79,12 @@ class _State:
     """Vertices and poses, their rendering, and its cost."""
 
     vertices: Tensor
-    poses: Pose
+    R: Tensor  # (B, 3, 3); t: (B, 3)
+    t: Tensor
     faces: SharedFaces
-    outlines: _Outlines
+    outlines: OutlineResiduals
+    stiffness: Tensor  # (M, 1) bending energy of each mode; offsets: (M, 3) the shape's coefficients
+    offsets: Tensor
     cost: float
 
 
@@ -120,8 +115,9 @@ def fit_jointly(
     if axis is None:
         free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
     state = _minimize(problem, free, iterations)
+    poses = from_matrix(state.R, state.t)
     keyframes = tuple(
-        replace(view, pose=state.poses[n], texture=None) for n, view in enumerate(object_map.keyframes)
+        replace(view, pose=poses[n], texture=None) for n, view in enumerate(object_map.keyframes)
     )
     return replace(object_map, vertices=state.vertices, keyframes=keyframes), state.cost
 
@@ -158,6 +154,7 @@ def _problem(object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights) -> _
         weights,
         torch.stack([o.K for o in observations]),
         layers_of(torch.stack([o.features for o in observations]), valid),
+        edges_of(object_map.shape.faces),
         torch.stack([o.outline_distance for o in observations]),
         torch.tensor(believed).to(object_map.vertices),
     )
@@ -166,7 +163,7 @@ def _problem(object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights) -> _
 def _minimize(problem: _Problem, free: Tensor, iterations: int) -> _State:
     """The best state that Levenberg-Marquardt reaches in the free unknowns."""
     poses = Pose.stack([view.pose for view in problem.object_map.keyframes])
-    state = _evaluate(problem, problem.object_map.vertices, poses)
+    state = _evaluate(problem, problem.object_map.vertices, poses.R, poses.translation)
     equations: _Equations | None = None
     damping, small = _DAMPING, 0
     for _ in range(iterations):
@@ -198,12 +195,12 @@ def _step(
         matrix, gradient, free = tied.T @ matrix @ tied, tied.T @ gradient, (free[:, None] * tied != 0).any(0)
     matrix = matrix[free][:, free]
     diagonal = matrix.diagonal()
-    damped = matrix + torch.diag(damping * diagonal + 1e-7 * diagonal.max())
-    solution, failed = torch.linalg.solve_ex(damped, -gradient[free])
-    if failed or not solution.isfinite().all():
+    diagonal += damping * diagonal + 1e-7 * diagonal.max()
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if failed:
         return None
     step = torch.zeros_like(gradient)
-    step[free] = solution
+    step[free] = torch.cholesky_solve(-gradient[free, None], factor)[:, 0]
     step = step if problem.tied is None else tied @ step
     shape, poses, _ = step.split(
         [problem.shape_unknowns, 6 * len(problem.K), len(step) - problem.shape_unknowns - 6 * len(problem.K)]
@@ -212,36 +209,30 @@ def _step(
     vertices = vertices if problem.tied is not None else unfold(problem.object_map.shape, vertices)
     # Steps (v, w) in the camera's axes, about the poses' own translations.
     moving, turning = poses.reshape(-1, 6).to(vertices).split(3, dim=1)
-    moved = from_matrix(rotation_exponential(turning) @ state.poses.R, state.poses.translation + moving)
-    return _evaluate(problem, vertices, moved)
+    return _evaluate(problem, vertices, rotation_exponential(turning) @ state.R, state.t + moving)
 
 
-def _evaluate(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
+def _evaluate(problem: _Problem, vertices: Tensor, R: Tensor, t: Tensor) -> _State:
     """The rendering of vertices and poses, and its cost."""
     object_map = problem.object_map
     drawn = render(
-        vertices, object_map.shape.faces, object_map.shape.face_uvs, vertices.new_zeros(1, 8, 8), poses.R,
-        poses.translation, problem.K, (problem.size, problem.size), backend=object_map.renderer,
+        vertices, object_map.shape.faces, object_map.shape.face_uvs, vertices.new_zeros(1, 8, 8), R, t, problem.K,
+        (problem.size, problem.size), backend=object_map.renderer,
     )  # fmt: skip
-    faces, outlines = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE), _outlines(problem, drawn)
+    faces = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE)
+    outlines, outline_cost = _outlines(problem, drawn)
     stiffness, offsets = _bending(problem, vertices)
-    cost = _APPEARANCE * faces.cost + outlines.cost + float((stiffness * offsets.square()).sum())
-    return _State(vertices, poses, faces, outlines, cost)
+    cost = _APPEARANCE * faces.cost + outline_cost + float((stiffness * offsets.square()).sum())
+    return _State(vertices, R, t, faces, outlines, stiffness, offsets, cost)
 
 
 def _linearize(problem: _Problem, state: _State) -> _Equations:
     """Normal equations in the modes, the poses and the light."""
-    modes, R, t = problem.modes, state.poses.R, state.poses.translation
-    by_faces = face_equations(state.faces, R, t)
-    matrix, gradient = project_on_basis(by_faces, modes, problem.object_map.shape.faces)
-    matrix, gradient = _APPEARANCE * matrix, _APPEARANCE * gradient
-    jacobian, weighted = _outline_rows(problem, state.outlines, R, t)
-    count = jacobian.shape[1]
-    matrix[:count, :count] += (jacobian.T @ weighted).double()
-    gradient[:count] += (weighted.T @ state.outlines.residual).double()
-    stiffness, offsets = _bending(problem, state.vertices)
+    modes, stiffness = problem.modes, state.stiffness
+    equations = normal_equations(state.faces, state.outlines, _APPEARANCE, state.R, state.t, modes)
+    matrix, gradient = (torch.from_numpy(one).to(modes.vectors) for one in equations)
     count = 3 * len(modes.bending)
-    gradient[:count] += 2 * (stiffness * offsets).reshape(-1)
+    gradient[:count] += 2 * (stiffness * state.offsets).reshape(-1)
     matrix.diagonal()[:count] += 2 * stiffness.expand(-1, 3).reshape(-1)
     return _Equations(matrix, gradient)
 
@@ -253,8 +244,9 @@ def _bending(problem: _Problem, vertices: Tensor) -> tuple[Tensor, Tensor]:
     return stiffness, modes.vectors.T @ (vertices - problem.object_map.shape.rest).double()
 
 
-def _outlines(problem: _Problem, drawn: Rendering) -> _Outlines:
-    weights, contour = problem.weights, find_contour(drawn)
+def _outlines(problem: _Problem, drawn: Rendering) -> tuple[OutlineResiduals, float]:
+    """The rendered outlines' distances from the masks', and their cost."""
+    weights, contour = problem.weights, find_contour(drawn, problem.edges)
     view = contour.view
     scale = _FULL_SIZE / problem.size
     residual, slope = (part * scale for part in contour_slopes(contour, problem.distance))
@@ -262,20 +254,4 @@ def _outlines(problem: _Problem, drawn: Rendering) -> _Outlines:
     weight = weights.outline * contour.length / total[view] / contour.frames * problem.mask_weight[view]
     square = weights.outline_scale**2
     cost = float((weight * square * torch.log1p(residual.square() / square)).sum())
-    return _Outlines(contour, residual, slope, weight, cost)
-
-
-def _outline_rows(problem: _Problem, outlines: _Outlines, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The outlines' Jacobian in modes and poses ``(N, 3 M + 6 B)``, and the same by its robust weights."""
-    contour, residual, slope = outlines.contour, outlines.residual, outlines.slope
-    view, vectors = contour.view, problem.modes.vectors
-    motion = screen_motion(contour.points, problem.K[view], t[view])
-    by_pose = torch.einsum("ni,nia->na", slope, motion)
-    by_object = torch.einsum("na,nab->nb", by_pose[:, :3], R[view])
-    mode = (contour.share[:, :, None] * vectors.to(slope)[contour.vertices]).sum(1)
-    by_mode = (mode[:, :, None] * by_object[:, None]).flatten(1)
-    by_poses = by_pose.new_zeros(len(view), contour.frames, 6)
-    by_poses[torch.arange(len(view)), view] = by_pose
-    jacobian = torch.cat([by_mode, by_poses.flatten(1)], 1)
-    square = problem.weights.outline_scale**2
-    return jacobian, jacobian * (2 * outlines.weight / (1 + residual.square() / square))[:, None]
+    return OutlineResiduals(contour, residual, slope, 2 * weight / (1 + residual.square() / square)), cost

@@ -9,22 +9,25 @@ step would hold the surface where it is, and the step would be far too short. Th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.rendering import Rendering
-from tracking3d.rendering.normal_equations import screen_motion
+from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
+from tracking3d.rendering import Contour, Rendering
 
-_DEPTH_TOLERANCE = 0.05  # of the radius: a face is hidden if something is nearer by more
-_GRAZING = 0.1  # faces seen at a smaller cosine are not compared
-_LITTLE = 0.05  # share of its best view's weight below which a face is not seen by a view
+if TYPE_CHECKING:
+    from tracking3d.estimation.online.optimization.kernels.shading import Sights
+
+FloatArray = NDArray[np.float64]
 _SINGLE = (
     0.5  # loss of what one view alone shows, so that the object does not turn to where nothing contradicts
 )
 _RIDGE = 1e-3  # on the light, as a share of the weight of all faces
-_ROUNDS = 3  # of the robust means
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,47 +35,35 @@ class SharedFaces:
     """What B views show of the faces that two views or more show, C channels."""
 
     cost: float  # the mean Cauchy loss, of what one view alone shows too
-    faces: Tensor  # (N,) int64, which they are
-    # (N, B, 3, 3) in the cameras' axes; normal: (N, B, 3); length: (N, B, 1), twice their areas
-    corner: Tensor
-    normal: Tensor
-    length: Tensor
-    slopes: tuple[Tensor, Tensor]  # two of (N, B, C), of the values by x and by y
-    light: Tensor  # (C, 3)
-    residual: Tensor  # (N, B, C); used: (N, B, C) their weights as in the matrix of the Cauchy loss
-    used: Tensor
-    K: Tensor  # (B, 3, 3)
+    drawn: tuple[NDArray[Any], ...]  # x_cam, screen, depth, K and faces of the rendering
+    sights: Sights
+    ends: NDArray[np.int64]  # (N + 1,) where the sights of each of N faces end
+    light: FloatArray  # (C, 3)
     scale: float  # difference of features at which the loss is log 2
 
 
 @dataclass(frozen=True, eq=False)
-class FaceEquations:
-    """A quadratic model of the mean Cauchy loss over what B views show, C channels.
+class OutlineResiduals:
+    """Distances of the rendered outlines from the masks', N in all."""
 
-    The G further unknowns are the poses' ``(v, w)``, six for each view, see `NormalEquations`, and the light's three
-    for each channel.
-    """
-
-    faces: Tensor  # (N,) int64, the faces that two views or more show
-    corners: Tensor  # (N, 9, 9) matrix in each face's corners, in object coordinates
-    mixed: Tensor  # (N, 9, G) between corners and the rest; rest: (G, G)
-    rest: Tensor
-    by_corners: Tensor  # (N, 9) gradient; by_rest: (G,)
-    by_rest: Tensor
+    contour: Contour
+    residual: Tensor  # (N,) pixels; slope: (N, 2) by x and y
+    slope: Tensor
+    weight: Tensor  # (N,) as in the matrix of their loss
 
 
-def layers_of(features: Tensor, valid: Tensor) -> Tensor:
-    """``(B, 3 C + 1, S, S)``: ``features`` ``(B, C, S, S)`` smoothed, their slopes by x and by y, and ``valid``."""
+def layers_of(features: Tensor, valid: Tensor) -> NDArray[np.float32]:
+    """``(B, S, S, 3 C + 1)``: ``features`` ``(B, C, S, S)`` smoothed, their slopes by x and by y, and ``valid``."""
     count = features.shape[1]
     binomial = features.new_tensor([1.0, 2.0, 1.0]) / 4
     difference = features.new_tensor([-0.5, 0.0, 0.5])
     smooth = _filter(_filter(features, binomial[None], count), binomial[:, None], count)
     slopes = [_filter(smooth, difference[None], count), _filter(smooth, difference[:, None], count)]
-    return torch.cat([smooth, *slopes, valid[:, None]], 1)
+    layers = torch.cat([smooth, *slopes, valid[:, None]], 1).permute(0, 2, 3, 1)
+    return layers.contiguous().cpu().float().numpy()
 
 
-@torch.no_grad()
-def shared_faces(drawn: Rendering, layers: Tensor, scale: float) -> SharedFaces:
+def shared_faces(drawn: Rendering, layers: NDArray[np.float32], scale: float) -> SharedFaces:
     """What the views show of the same faces at the present shape and poses.
 
     Args:
@@ -80,114 +71,74 @@ def shared_faces(drawn: Rendering, layers: Tensor, scale: float) -> SharedFaces:
         layers: From `layers_of`.
         scale: Difference of features at which the loss is ``log 2``.
     """
-    corner = drawn.x_cam[:, drawn.faces].transpose(0, 1)  # (F, B, 3, 3)
-    a, b, c = corner.unbind(2)
-    double_area = torch.linalg.cross(b - a, c - a)
-    length = double_area.norm(dim=2, keepdim=True).clamp_min(1e-12)
-    normal = double_area / length
-    weight, sampled = _weights(drawn, corner.mean(2), normal, layers)
-    seen = (weight > _LITTLE * weight.amax(1, keepdim=True)) & (weight > 0)
-    faces = torch.nonzero(seen.sum(1) >= 2)[:, 0]
-    whole = weight.sum().clamp_min(1e-9)
-    single = float(1 - weight[faces].sum() / whole)
-    corner, normal, length = corner[faces], normal[faces], length[faces]
-    count = (layers.shape[1] - 1) // 3
-    value, by_x, by_y = sampled[faces].split(count, 2)  # (N, B, C)
-    full = (weight[faces] / (whole * count))[..., None].expand_as(value)
-    light, residual, used = _shade(value, normal, full, scale)
-    cost = float((full * torch.log1p(residual.square() / scale**2)).sum()) + _SINGLE * single
-    cost += _RIDGE * float(light.square().sum()) / (count * scale**2)
-    return SharedFaces(
-        cost, faces, corner, normal, length, (by_x, by_y), light, residual, used, drawn.K, scale
-    )
+    from tracking3d.estimation.online.optimization.kernels import shading
+
+    tensors = drawn.x_cam, drawn.screen, drawn.depth, drawn.K
+    x_cam, *rest = (_array(one, np.float32) for one in tensors)
+    faces = _array(drawn.faces, np.int64)
+    arrays = x_cam, *rest, faces
+    most, channels = len(faces) * len(x_cam), layers.shape[3] // 3
+    sights = shading.Sights(
+        np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, 3)), np.empty((most, 3 * channels)),
+        np.empty(most), np.empty((most, channels)), np.empty((most, channels)),
+    )  # fmt: skip
+    ends, totals = np.zeros(len(faces) + 1, np.int64), np.zeros(2)
+    radius = float(np.linalg.norm(x_cam[0] - x_cam[0].mean(0), axis=1).max())
+    ends = ends[: shading.find_sights(arrays, layers, radius, sights, ends, totals) + 1]
+    sights = shading.Sights._make(one[: ends[-1]] for one in sights)
+    whole, light = max(totals[0], 1e-9), np.zeros((channels, 3))
+    sights.weight[:] /= whole * channels
+    loss = shading.shade(sights, ends, scale, _RIDGE / channels, light)
+    cost = loss + _SINGLE * (1 - totals[1] / whole) + _RIDGE * float((light**2).sum()) / (channels * scale**2)
+    return SharedFaces(float(cost), arrays, sights, ends, light, scale)
 
 
-@torch.no_grad()
-def face_equations(shown: SharedFaces, R: Tensor, t: Tensor) -> FaceEquations:
-    """The model at the present shape and poses, ``R`` ``(B, 3, 3)`` and ``t`` ``(B, 3)``."""
-    faces, corner, normal, length = shown.faces, shown.corner, shown.normal, shown.length
-    (by_x, by_y), light, used = shown.slopes, shown.light, shown.used
-    frames, count = len(R), len(light)
-    # Derivatives of a view's value, less the light's part, by the corners in the camera's axes.
-    middle = corner.mean(2).reshape(-1, 3)
-    K = shown.K.repeat(len(faces), 1, 1)
-    motion = screen_motion(middle, K, middle)[:, :, :3].reshape(len(faces), frames, 2, 3)
-    moving = by_x[..., None] * motion[:, :, None, 0] + by_y[..., None] * motion[:, :, None, 1]  # (N, B, C, 3)
-    across = light - (normal @ light.T)[..., None] * normal[:, :, None]
-    opposite = (corner.roll(-2, 2) - corner.roll(-1, 2)) / length[..., None]  # (N, B, 3, 3)
-    turning = torch.linalg.cross(across[:, :, :, None], opposite[:, :, None])
-    by_corner = moving[:, :, :, None] / 3 - turning  # (N, B, C, 3, 3)
-    arm = (corner - t[:, None])[:, :, None]
-    by_pose = torch.cat([by_corner.sum(3), torch.linalg.cross(arm, by_corner).sum(3)], 3)  # (N, B, C, 6)
-    by_corner = (by_corner @ R[:, None]).flatten(3)  # (N, B, C, 9)
+def normal_equations(
+    shown: SharedFaces, outlines: OutlineResiduals, factor: float, R: Tensor, t: Tensor, modes: ShapeBasis
+) -> tuple[FloatArray, FloatArray]:
+    """Matrix and gradient of both costs in ``3 M + 6 B + 3 C`` unknowns.
 
-    # Taking off the weighted mean over the views eliminates the own colour; one side of each product suffices.
-    total = used.sum(1).clamp_min(1e-20)  # (N, C)
-    share = (used / total[:, None])[..., None]
-    centred = used[..., None] * (by_corner - (share * by_corner).sum(1, keepdim=True))
-    pull = used[..., None] * by_pose
-    tilt = normal[:, :, None] - (share * normal[:, :, None]).sum(1, keepdim=True)  # (N, B, C, 3)
-    corners = centred.flatten(1, 2).mT @ by_corner.flatten(1, 2)
-    with_poses = (centred.mT @ by_pose).transpose(1, 2).reshape(len(faces), 9, 6 * frames)
-    with_light = -(centred.transpose(1, 2).mT @ normal[:, None]).transpose(1, 2).flatten(2)
-    flat = pull.permute(0, 2, 1, 3).flatten(2)  # (N, C, 6 B)
-    spread = (flat / total.sqrt()[..., None]).flatten(0, 1)
-    own = [
-        p.flatten(0, 1).T @ q.flatten(0, 1) for p, q in zip(pull.unbind(1), by_pose.unbind(1), strict=True)
-    ]
-    poses = torch.block_diag(*own) - spread.T @ spread
-    poses_light = -torch.einsum("nbcp,nbci->bpci", pull, tilt).reshape(6 * frames, 3 * count)
-    per_channel = torch.einsum("nbc,nbi,nbcj->cij", used, normal, tilt)
-    ridge = torch.eye(3).to(tilt) * (2 * _RIDGE / (count * shown.scale**2))
-    lights = torch.block_diag(*(per_channel + ridge))
-    rest = torch.cat([torch.cat([poses, poses_light], 1), torch.cat([poses_light.T, lights], 1)])
-    error = (used * shown.residual)[..., None]
-    return FaceEquations(
-        faces,
-        corners,
-        torch.cat([with_poses, with_light], 2),
-        rest,
-        (error * by_corner).sum((1, 2)),
-        torch.cat([(error * by_pose).sum((0, 2)).flatten(), poses.new_zeros(3 * count)]),
-    )
+    A mode's three directions are neighbours. A pose has ``(v, w)``, see `NormalEquations`, and a channel's light three.
+
+    Args:
+        shown: At the present shape and poses.
+        outlines: The same.
+        factor: The weight of what is shown.
+        R: ``(B, 3, 3)``; t: ``(B, 3)``.
+        modes: The modes of the shape.
+    """
+    from tracking3d.estimation.online.optimization.kernels import shading
+
+    (_, _, _, K, faces), contour = shown.drawn, outlines.contour
+    vertices = _array(contour.vertices, np.int64)
+    seen = np.zeros(len(modes.vectors), bool)
+    seen[faces[shown.sights.face]] = True
+    seen[vertices] = True
+    basis = _array(modes.vectors, np.float64)[seen]
+    count, channels, poses = basis.shape[1], len(shown.light), 6 * len(R)
+    others, own = poses + 3 * channels, factor * 2 / shown.scale**2
+    sums, rest = np.zeros((len(basis), 6 * count + 3 * (others + 1))), np.zeros((others, others + 1))
+    at_vertices = seen.cumsum() - 1, basis, sums, rest
+    turns, moves = _array(R, np.float64), _array(t, np.float64)
+    shading.add_faces(shown.drawn, shown.sights, shown.ends, shown.light, turns, moves, own, at_vertices)
+    residuals = torch.stack([outlines.residual, outlines.weight], 1)
+    parts = (_array(one, np.float64) for one in (contour.share, contour.points, outlines.slope, residuals))
+    shading.add_outlines(_array(contour.view, np.int64), vertices, *parts, K, turns, moves, at_vertices)
+    rest.reshape(-1)[poses * (others + 1) + poses :: others + 2] += own * _RIDGE / channels
+    sums = basis.T @ sums
+    mixed = sums[:, 6 * count :].reshape(3 * count, others + 1)
+    matrix = np.empty((3 * count + others, 3 * count + others))
+    for row, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
+        part = sums[:, row * count : (row + 1) * count]
+        matrix[i : 3 * count : 3, j : 3 * count : 3] = part
+        matrix[j : 3 * count : 3, i : 3 * count : 3] = part.T
+    matrix[: 3 * count, 3 * count :], matrix[3 * count :, : 3 * count] = mixed[:, :-1], mixed[:, :-1].T
+    matrix[3 * count :, 3 * count :] = np.triu(rest[:, :-1]) + np.triu(rest[:, :-1], 1).T
+    return matrix, np.concatenate([mixed[:, -1], rest[:, -1]])
 
 
-def _weights(drawn: Rendering, middle: Tensor, normal: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
-    """What each view's sight of each face counts ``(F, B)``, and the sampled layers ``(F, B, 3 C)`` there."""
-    x, y, z = middle.unbind(2)
-    K, size = drawn.K, layers.shape[-1]
-    pixel = torch.stack([K[:, 0, 0] * x / z + K[:, 0, 2], K[:, 1, 1] * y / z + K[:, 1, 2]], 2)
-    grid = ((2 * pixel + 1) / size - 1).transpose(0, 1)[:, None]  # (B, 1, F, 2)
-    sampled = functional.grid_sample(layers, grid, align_corners=False)[:, :, 0].permute(2, 0, 1)
-    depth = torch.where(drawn.depth.isinf(), 0.0, drawn.depth)[:, None]
-    front = functional.grid_sample(depth, grid, mode="nearest", align_corners=False)[:, 0, 0].T
-    cosine = -(normal * functional.normalize(middle, dim=2)).sum(2)
-    radius = (drawn.x_cam[0] - drawn.x_cam[0].mean(0)).norm(dim=1).max()
-    visible = (
-        (cosine > _GRAZING)
-        & (front > 0)
-        & (z < front + _DEPTH_TOLERANCE * radius / cosine.clamp_min(_GRAZING))
-    )
-    a, b, c = drawn.screen[:, drawn.faces].transpose(0, 1).unbind(2)
-    u, v = b - a, c - a
-    pixels = (u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]).abs() / 2
-    return visible * pixels * cosine.clamp_min(0) * sampled[..., -1], sampled[..., :-1]
-
-
-def _shade(value: Tensor, normal: Tensor, full: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The light ``(C, 3)``, the residuals ``(N, B, C)``, and their weights as in the matrix of the Cauchy loss."""
-    used, residual = full, value
-    light = value.new_zeros(value.shape[2], 3)
-    ridge = torch.eye(3).to(value) * (_RIDGE / value.shape[2])
-    for _ in range(_ROUNDS):
-        share = used / used.sum(1, keepdim=True).clamp_min(1e-20)
-        tilt = normal[:, :, None] - (share[..., None] * normal[:, :, None]).sum(1, keepdim=True)
-        matrix = torch.einsum("nbc,nbci,nbcj->cij", used, tilt, tilt) + ridge
-        light = torch.linalg.solve(matrix, torch.einsum("nbc,nbci,nbc->ci", used, tilt, value))
-        own = value - normal @ light.T
-        residual = own - (share * own).sum(1, keepdim=True)
-        used = full / (1 + residual.square() / scale**2)
-    return light, residual, used * (2 / scale**2)
+def _array(tensor: Tensor, kind: type[np.generic]) -> NDArray[Any]:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), kind)
 
 
 def _filter(images: Tensor, kernel: Tensor, count: int) -> Tensor:

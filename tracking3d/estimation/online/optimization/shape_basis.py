@@ -1,4 +1,4 @@
-"""The smooth ways in which a shape can change, and equations in them: few unknowns in place of all vertices."""
+"""The smooth ways in which a shape can change: few unknowns in place of all vertices."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 from torch import Tensor
 
-from tracking3d.estimation.online.optimization.shading import FaceEquations
 from tracking3d.estimation.shape import Shape
 
 MODES = 80
@@ -67,36 +66,3 @@ def _lowest_modes(matrix: sparse.csc_matrix, count: int) -> tuple[NDArray[np.flo
         vectors[:, start:end] = vectors[:, start:end] @ (turn * np.sign(np.diag(signed)))
         values[start:end] = values[start:end].mean()
     return values[: ends[-1]], vectors[:, : ends[-1]]
-
-
-def project_on_basis(shown: FaceEquations, modes: ShapeBasis, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrix and gradient of face equations in ``(3 M + G)`` unknowns; a mode's three directions are neighbours.
-
-    Args:
-        shown: In the corners of faces and G further unknowns.
-        modes: The modes of the shape.
-        faces: ``(F, 3)`` of the shape.
-    """
-    corner = faces[shown.faces]
-    vertices, count = modes.vectors.shape
-    rows = corner[:, :, None].expand(-1, 3, 3).flatten().cpu().numpy()
-    columns = corner[:, None].expand(-1, 3, 3).flatten().cpu().numpy()
-    blocks = shown.corners.double().reshape(-1, 3, 3, 3, 3).cpu().numpy()  # (N, corner, xyz, corner, xyz)
-    basis = modes.vectors.cpu().numpy()
-    shape = np.zeros((count, 3, count, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            entries = sparse.csr_matrix(
-                (blocks[:, :, i, :, j].ravel(), (rows, columns)), shape=(vertices, vertices)
-            )
-            part = basis.T @ (entries @ basis)
-            shape[:, i, :, j], shape[:, j, :, i] = part, part.T
-    at_corners = torch.cat([shown.mixed, shown.by_corners[..., None]], 2)
-    width = at_corners.shape[2]
-    at_vertices = at_corners.new_zeros(vertices, 3 * width).index_add(
-        0, corner.flatten(), at_corners.reshape(-1, 3 * width)
-    )
-    mixed = (modes.vectors.to(at_vertices).T @ at_vertices).reshape(3 * count, width).double()
-    top = torch.cat([torch.from_numpy(shape.reshape(3 * count, 3 * count)).to(mixed), mixed[:, :-1]], 1)
-    bottom = torch.cat([mixed[:, :-1].T, shown.rest.double()], 1)
-    return torch.cat([top, bottom]), torch.cat([mixed[:, -1], shown.by_rest.double()])

@@ -28,17 +28,15 @@ from tracking3d.points.bundle_adjustment.kernels.reprojection import (
 from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
 from tracking3d.rendering.kernels.compilation import kernel, record, share
+from tracking3d.rendering.kernels.normal_equations import COMPARABLE, KNOWN, SURFACE
 from tracking3d.rendering.kernels.pose_terms import (
     APPEARANCE,
     BOTH,
-    COMPARABLE,
     EITHER,
-    KNOWN,
     MATCHES,
     OUTLINE,
     POINTS,
     SCALES,
-    SURFACE,
     TARGET,
     LossScales,
     drawing_buffers,
