@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,7 +52,7 @@ class Pose:
     def R(self) -> Tensor:
         """``(..., 3, 3)`` rotation matrix."""
         if is_single(self.quaternion, 1):
-            return matrix_of(self.quaternion)
+            return self._single_R
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
         result: Tensor = quaternion_to_rotation_matrix(self.quaternion)
@@ -59,10 +60,18 @@ class Pose:
 
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 ``T_cam_obj`` of a single pose, on the CPU."""
-        pose = Pose(self.translation.detach().double().cpu(), self.quaternion.detach().double().cpu())
+        return self._single_matrix.clone()
+
+    # A pose of the map is asked for its matrices in every frame.
+    @cached_property
+    def _single_R(self) -> Tensor:
+        return matrix_of(self.quaternion)
+
+    @cached_property
+    def _single_matrix(self) -> Tensor:
         T_cam_obj = torch.eye(4, dtype=torch.float64)
-        T_cam_obj[:3, :3] = pose.R
-        T_cam_obj[:3, 3] = pose.translation
+        T_cam_obj[:3, :3] = Pose(self.translation, self.quaternion.detach().double().cpu()).R
+        T_cam_obj[:3, 3] = self.translation.detach()
         return T_cam_obj
 
 

@@ -397,8 +397,8 @@ STILL = np.deg2rad(0.05)
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Drawn, float]:
-    """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
+def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Array, float]:
+    """The pose ``(4, 4)`` at which a view shows what other views show, and how much of that it shows there.
 
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
 
@@ -407,9 +407,11 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """
-    share = 0.0
-    for _ in range(TURNS):
-        others = [scene.views[index] for index in known]
+    T_cam_obj, share = view.T_cam_obj, 0.0
+    others = [scene.views[index] for index in known]
+    for turn in range(TURNS):
+        if turn:
+            view = redraw_surface(view, scene.vertices, scene.faces, T_cam_obj)
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
             _carry_tracks(scene, warps, source, index)
@@ -417,7 +419,7 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
             if others[source] is not None
         ]
         if not found:
-            return view, share
+            return T_cam_obj, share
         points, measured, deviation = (np.concatenate(part) for part in zip(*found, strict=True))
         placed = bundle(
             points,
@@ -428,11 +430,11 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Dra
             _FIXED * scene.radius,
         )
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
-        before, view = view, redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
-        turned = view.T_cam_obj[:3, :3] @ before.T_cam_obj[:3, :3].T
+        T_cam_obj = placed.T_cam_obj[0]
+        turned = T_cam_obj[:3, :3] @ view.T_cam_obj[:3, :3].T
         if Rotation.from_matrix(turned).magnitude() < STILL:
             break
-    return view, share
+    return T_cam_obj, share
 
 
 def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int, index: int) -> tuple[Array, Array, Array]:

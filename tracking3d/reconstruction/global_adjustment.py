@@ -177,7 +177,7 @@ class GlobalAdjustment:
         resected, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
+        return resected, LandmarkSupport(followed, round(share * followed))
 
     def deviation(self, record: FrameRecord, T_cam_obj: _Pose) -> float:
         """Degrees by which `pose` turned a frame against the other frames; infinite if it had no landmarks to do so.
@@ -328,7 +328,7 @@ class HeldAdjustment:
         )
         resected, share = resect(scene, view, range(len(sources)))
         followed = max(self._shares[index].followed for index in sources)
-        return resected.T_cam_obj, LandmarkSupport(followed, round(share * followed))
+        return resected, LandmarkSupport(followed, round(share * followed))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model as it is: its surface was refined before."""

@@ -24,7 +24,7 @@ from tracking3d.rendering.silhouette import soft_silhouette
 from tracking3d.rendering.surface import Surface, sample_texture
 from tracking3d.rendering.surface_visibility import visible_texels, visible_vertices
 from tracking3d.rendering.texture_losses import channels_last, texture_losses
-from tracking3d.rendering.visibility import Visibility, rasterize
+from tracking3d.rendering.visibility import Visibility, nearest_depth, rasterize
 
 __all__ = [
     "BackProjection",
@@ -50,6 +50,7 @@ __all__ = [
     "pose_normal_equations",
     "pose_terms",
     "prepare_backend",
+    "nearest_depth",
     "project",
     "rasterize",
     "render",

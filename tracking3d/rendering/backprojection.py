@@ -20,7 +20,7 @@ from torch.nn import functional
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.interpolation import barycentrics
 from tracking3d.rendering.renderer import project
-from tracking3d.rendering.visibility import rasterize
+from tracking3d.rendering.visibility import nearest_depth, rasterize
 
 _DEPTH_TOLERANCE = 0.02
 """A texel is hidden if something is nearer by more than this share of the mesh's radius."""
@@ -140,7 +140,7 @@ def seen_texels(
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])
-    drawn = rasterize(screen, depth, faces, (height, width), backend).depth
+    drawn = nearest_depth(screen[0], depth[0], faces, (height, width), backend)
     x_cam = vertices @ R.T + t
     corner = x_cam[faces]
     normal = functional.normalize(
@@ -155,7 +155,7 @@ def seen_texels(
         atlas = texels.texel, texels.face, texels.barycentric
         tolerance = _DEPTH_TOLERANCE * float(radius)
         seen = backprojection.seen_texels(
-            values, valid, drawn[0], corner, normal, facing, atlas, K, _GRAZING, tolerance
+            values, valid, drawn, corner, normal, facing, atlas, K, _GRAZING, tolerance
         )
         return SeenTexels(*seen)
     front = torch.nonzero(facing[texels.face])[:, 0]
@@ -168,7 +168,7 @@ def seen_texels(
     pixel = torch.stack([K[0, 0], K[1, 1]]) * point[:, :2] / point[:, 2:] + K[:2, 2]
     grid = ((2 * pixel + 1) / pixel.new_tensor([width, height]) - 1)[None, None]
     nearest = functional.grid_sample(
-        torch.where(drawn.isinf(), 0.0, drawn)[None], grid, mode="nearest", align_corners=False
+        torch.where(drawn.isinf(), 0.0, drawn)[None, None], grid, mode="nearest", align_corners=False
     )[0, 0, 0]
     visible = (nearest > 0) & (point[:, 2] < nearest + _DEPTH_TOLERANCE * radius / cosine)
     layers = torch.cat([values, valid[None]])

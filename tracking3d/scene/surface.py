@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.rendering.visibility import rasterize
+from tracking3d.rendering.visibility import nearest_depth
 from tracking3d.scene.view import Array, Mask, ObjectView, Plane, project_points
 
 _MOST_AT_ONCE = 2**14  # pixels that OpenCV looks up in one call
@@ -106,12 +106,12 @@ def draw_depth(
     Without a pose, or where nothing is seen of the surface, the first is 0 and the second more than any distance.
     """
     screen, depth = project_points(vertices, K, T_cam_obj)
-    drawn = rasterize(
-        torch.tensor(np.nan_to_num(screen, nan=-1e6), dtype=torch.float32)[None],
-        torch.tensor(depth, dtype=torch.float32)[None],
+    drawn = nearest_depth(
+        torch.from_numpy(np.nan_to_num(screen, nan=-1e6).astype(np.float32)),
+        torch.from_numpy(depth.astype(np.float32)),
         torch.tensor(faces),
         size,
-    ).depth[0].numpy()  # fmt: skip
+    ).numpy()
     covered = np.asarray(np.isfinite(drawn))
     if not covered.any():
         return np.zeros(size, np.float32), np.full(size, sum(size), np.float32)

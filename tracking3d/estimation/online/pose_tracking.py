@@ -184,8 +184,7 @@ def resect_pose(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pos
     begun = sum(len(scene.seeds_of(position)[2]) for position in known)
     if share < _MIN_SHARE or share * begun < _MIN_AGREEING:
         return pose
-    T = resected.T_cam_obj
-    corrected = pose_from_arrays(T[:3, :3], T[:3, 3], object_map.vertices)
+    corrected = pose_from_arrays(resected[:3, :3], resected[:3, 3], object_map.vertices)
     turn = float(rotation_angle(corrected.quaternion, pose.quaternion))
     return corrected if turn < _MAX_TURN else pose
 

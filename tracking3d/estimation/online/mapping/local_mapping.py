@@ -22,8 +22,8 @@ from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks, adjust
+from tracking3d.rendering import nearest_depth
 from tracking3d.rendering import project as project_vertices
-from tracking3d.rendering import rasterize
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is the same as a tracked point
@@ -50,12 +50,8 @@ def lift_pixels(
     screen, depth = project_vertices(
         object_map.vertices, view.pose.R[None], view.pose.translation[None], K[None]
     )
-    drawn = (
-        rasterize(screen, depth, object_map.shape.faces, (size, size), object_map.renderer)
-        .depth[0]
-        .cpu()
-        .numpy()
-    )
+    drawn = nearest_depth(screen[0], depth[0], object_map.shape.faces, (size, size), object_map.renderer)
+    drawn = drawn.cpu().numpy()
     in_window = (to_window(view, pixel) + 0.5) * finer - 0.5
     column, row = np.clip(np.rint(in_window), 0, size - 1).astype(int).T
     inside = (np.abs(in_window - (size - 1) / 2) <= size / 2).all(1)
