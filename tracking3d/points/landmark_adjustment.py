@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
@@ -343,6 +344,10 @@ def seeds(view: Drawn, vertices: Array, faces: NDArray[np.int64]) -> Corners:
     return face[on], barycentric[on], xy[on]
 
 
+SYMMETRIC: Mapping[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}
+}  # fmt: skip
+"""Of `scipy.sparse.linalg.splu`, for a factorization that keeps the symmetry of positive equations."""
 _STAY = 1e-3  # weight that holds every vertex, so that there is one answer
 
 
@@ -387,7 +392,7 @@ def move_surface(
         + stiffness * (laplacian.T @ laplacian)
         + _STAY * sparse.eye(len(vertices))
     )
-    moved: Array = vertices + spsolve(H.tocsc(), on.T @ (weight[:, None] * gap))
+    moved: Array = vertices + splu(H.tocsc(), **SYMMETRIC).solve(on.T @ (weight[:, None] * gap))
     return moved
 
 

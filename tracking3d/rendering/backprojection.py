@@ -99,11 +99,8 @@ def back_project(
     K: Tensor,
     backend: str = "auto",
 ) -> BackProjection:
-    """What one frame shows of the texture; see `seen_texels` for the arguments.
-
-    Solvers go on from it: it is torch's to the last digit with every backend.
-    """
-    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend, by_kernel=False)
+    """What one frame shows of the texture; see `seen_texels` for the arguments."""
+    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend)
     size = texels.size
     total = values.new_zeros(values.shape[0], size * size)
     total[:, seen.texel] = seen.values * seen.weight
@@ -123,7 +120,6 @@ def seen_texels(
     t: Tensor,
     K: Tensor,
     backend: str = "auto",
-    by_kernel: bool = True,
 ) -> SeenTexels:
     """The texels that one frame shows.
 
@@ -136,7 +132,6 @@ def seen_texels(
         R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
         K: ``(3, 3)`` of the window.
         backend: See `tracking3d.rendering.backend`.
-        by_kernel: Whether texels may be looked up by the kernel, if that is the backend: it rounds otherwise.
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])
@@ -149,7 +144,7 @@ def seen_texels(
     # A face that turns away from all of its corners shows no texel: most of a large atlas is left out so.
     facing = ((corner * normal[:, None]).sum(2) < 0).any(1)
     radius = (vertices - vertices.mean(0)).norm(dim=1).max()
-    if by_kernel and use_numba(backend, values, valid, vertices, texels.barycentric):
+    if use_numba(backend, values, valid, vertices, texels.barycentric):
         from tracking3d.rendering.kernels import backprojection
 
         atlas = texels.texel, texels.face, texels.barycentric
