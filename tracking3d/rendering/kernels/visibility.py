@@ -36,9 +36,7 @@ def rasterize(
     return face_index, drawn, pixels
 
 
-def nearest_depth(
-    screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], near: float
-) -> Tensor:
+def nearest_depth(screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], near: float) -> Tensor:
     """``(H, W)``, see `tracking3d.rendering.visibility.nearest_depth`."""
     check_corners(faces, screen[None])
     drawn = np.zeros(size, np.float32)

@@ -129,7 +129,9 @@ def _solve(matrix: sparse.spmatrix, target: FloatArray) -> FloatArray:
     floor = _FLOOR * matrix.diagonal().max()
     damped = (matrix + floor * sparse.identity(len(target))).tocsc()
     factors = splu(damped.astype(np.float32), **SYMMETRIC)
-    nearly = LinearOperator(damped.shape, lambda rest: factors.solve(rest.astype(np.float32)), dtype=np.float64)
+    nearly = LinearOperator(
+        damped.shape, lambda rest: factors.solve(rest.astype(np.float32)), dtype=np.float64
+    )
     return np.asarray(cg(damped, target, rtol=_EXACT, maxiter=_MOST_STEPS, M=nearly)[0])
 
 
