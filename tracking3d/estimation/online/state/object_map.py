@@ -165,4 +165,4 @@ class ObjectMap:
         K = torch.tensor(camera.K, dtype=torch.float32, device=self.vertices.device)
         screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
         drawn = nearest_depth(screen[0], depth[0], self.shape.faces, size, self.renderer)
-        return np.asarray(drawn.isfinite().cpu().numpy(), dtype=np.bool_)
+        return np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's
