@@ -62,7 +62,14 @@ class Pose:
         """``(4, 4)`` float64 ``T_cam_obj`` of a single pose, on the CPU."""
         return self._single_matrix.clone()
 
-    # A pose of the map is asked for its matrices in every frame.
+    # A pose of the map is asked for these in every frame.
+    @cached_property
+    def viewing_direction(self) -> NDArray[np.float64]:
+        """``(3,)`` unit vector from the object's origin to the camera, in object coordinates, of a single pose."""
+        R, t = pose_arrays(self)
+        direction = -R.T @ t
+        return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
     @cached_property
     def _single_R(self) -> Tensor:
         return matrix_of(self.quaternion)

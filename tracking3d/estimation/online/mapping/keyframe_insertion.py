@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import takewhile
 
@@ -76,8 +77,8 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
     keyframes = object_map.keyframes
     if inliers < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
         return True
-    angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
-    return bool(np.degrees(min(angles)) > config.keyframe_rotation)
+    poses = Pose.stack([other.pose for other in keyframes])
+    return math.degrees(rotation_angle(poses.quaternion, fit.pose.quaternion).min()) > config.keyframe_rotation
 
 
 def insert_points(

@@ -173,12 +173,7 @@ def nearest_views(keyframes: tuple[Keyframe, ...], pose: Pose, most: int) -> lis
 
 def viewing_angle(a: Pose, b: Pose) -> float:
     """Degrees between two poses' viewing directions of the object."""
-    directions = []
-    for pose in (a, b):
-        R, t = pose_arrays(pose)
-        direction = -R.T @ t
-        directions.append(direction / max(float(np.linalg.norm(direction)), 1e-9))
-    return float(np.degrees(np.arccos(np.clip(directions[0] @ directions[1], -1, 1))))
+    return float(np.degrees(np.arccos(np.clip(a.viewing_direction @ b.viewing_direction, -1, 1))))
 
 
 def window_of(count: int, most: int) -> list[int]:
