@@ -78,7 +78,7 @@ class LandmarkScene:
     may_reverse: bool = False
     reversal: Reversal | None = None  # what was done to surface and poses, where landmarks said that it was
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Half the diagonal of the object's box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0))) / 2

@@ -46,6 +46,11 @@ class Drawn(ObjectView):
             cosine = np.abs((normal * ray).sum(1)) / length
         return np.where(np.isfinite(cosine) & (sample(self.beyond, xy) < 0.5), cosine, 0.0)
 
+    @cached_property
+    def _deepest_around(self) -> Plane:
+        # On a steep surface a pixel aside is much nearer or further.
+        return cv2.erode(self.inverse_depth, np.ones((3, 3), np.uint8))
+
     def sees(self, points: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
         """Where object points are, and which of them the surface does not hide and the window holds.
 
@@ -60,9 +65,7 @@ class Drawn(ObjectView):
         height, width = self.window.shape
         with np.errstate(invalid="ignore"):
             inside = ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(1)
-        # The deepest around: on a steep surface a pixel aside is much nearer or further.
-        around = cv2.erode(self.inverse_depth, np.ones((3, 3), np.uint8))
-        drawn = sample(around, xy).astype(np.float64)
+        drawn = sample(self._deepest_around, xy).astype(np.float64)
         near = inside & (drawn > 0) & (sample(self.beyond, xy) < 3)
         with np.errstate(invalid="ignore", divide="ignore"):
             return xy, near & (depth < 1 / drawn + tolerance)

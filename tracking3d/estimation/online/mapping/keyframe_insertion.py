@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from itertools import takewhile
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +27,7 @@ from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCan
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import Camera, pixel_distance
 from tracking3d.geometry.pose import Pose, pose_arrays, rotation_angle
 from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
@@ -78,7 +77,9 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
     if inliers < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
         return True
     poses = Pose.stack([other.pose for other in keyframes])
-    return math.degrees(rotation_angle(poses.quaternion, fit.pose.quaternion).min()) > config.keyframe_rotation
+    return (
+        math.degrees(rotation_angle(poses.quaternion, fit.pose.quaternion).min()) > config.keyframe_rotation
+    )
 
 
 def insert_points(
@@ -277,37 +278,7 @@ _MIN_SECTORS, _MIN_CANDIDATES = (
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(H, W)`` the band around a mask."""
     reach = max(round(_BAND_WIDTH * float(np.sqrt(mask.sum()))), 3)
-    return dilate_by_ellipse(mask, reach) & ~mask
-
-
-def dilate_by_ellipse(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """``(H, W)`` a mask dilated by OpenCV's ellipse of ``2 reach + 1`` pixels.
-
-    Row by row of the ellipse: that takes a time that grows with its height, and OpenCV's own grows with its area.
-    """
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if not width:
-        return np.zeros_like(mask)
-    rows = slice(max(y - reach, 0), min(y + height + reach, len(mask)))
-    columns = slice(max(x - reach, 0), min(x + width + reach, mask.shape[1]))
-    inside = mask[rows, columns]
-    place = np.arange(inside.shape[1], dtype=np.int32)
-    far = np.int32(4 * mask.shape[1])
-    before = place - np.maximum.accumulate(np.where(inside, place, -far), axis=1)
-    after = np.minimum.accumulate(np.where(inside, place, far)[:, ::-1], axis=1)[:, ::-1] - place
-    beside = np.minimum(np.minimum(before, after), reach + 1).astype(
-        np.int16
-    )  # pixels to the mask along the row
-    reached = np.zeros_like(inside)
-    half = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)).sum(1) // 2
-    count = len(inside)
-    for offset in range(-min(reach, count - 1), min(reach, count - 1) + 1):
-        to = slice(max(-offset, 0), min(count - offset, count))
-        there = slice(max(offset, 0), min(count + offset, count))
-        reached[to] |= beside[there] <= half[reach + offset]
-    dilated = np.zeros_like(mask)
-    dilated[rows, columns] = reached
-    return dilated
+    return (pixel_distance(mask) <= reach) & ~mask
 
 
 def with_candidates(
