@@ -23,8 +23,9 @@ _NEIGHBOURHOOD = 0.4
 _RARE, _MOST = 0.002, 3.0
 """Share that is added to either side's, and limit of the log of their ratio."""
 
-_SAMPLES = 44
-"""Along either side of a crop, from which its few colours are taken."""
+_SAMPLES, _COLOURS = 32, 24
+"""Pixels along either side of a crop from which its few colours are taken, and how many (measured: masks are as good
+as with 44 and 40)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[n
         lab: ``(S, S, 3)`` crop in 8-bit Lab.
         mask: ``(S, S)`` where the object seems to be.
     """
-    palette = Palette(lab, stride=max(round(len(lab) / _SAMPLES), 1))
+    palette = Palette(lab, _COLOURS, max(round(len(lab) / _SAMPLES), 1))
     labels = palette.label(lab)
     radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(mask))), 2)
     inside, beside = alike_around(labels, mask, radius, palette.size)
