@@ -18,15 +18,10 @@ from torch.nn import functional
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """One pose, or a batch of them.
+    """One pose, or a batch of them."""
 
-    Attributes:
-        translation: ``(..., 3)``.
-        quaternion: ``(..., 4)``, w first, unit length.
-    """
-
-    translation: Tensor
-    quaternion: Tensor
+    translation: Tensor  # (..., 3)
+    quaternion: Tensor  # (..., 4), w first, unit length
 
     @classmethod
     def identity(cls, translation: Tensor) -> Pose:

@@ -40,9 +40,8 @@ DEVIATION = 0.1
 """Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
-_LEAST_SUPPORT = (
-    60  # points in half of the views; with fewer, adjusted poses were wrong more often than right
-)
+# Points in half of the views; with fewer, adjusted poses were wrong more often than right
+_LEAST_SUPPORT = 60
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""

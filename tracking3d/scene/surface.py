@@ -47,8 +47,7 @@ class Drawn(ObjectView):
         return np.where(np.isfinite(cosine) & (sample(self.beyond, xy) < 0.5), cosine, 0.0)
 
     @cached_property
-    def _deepest_around(self) -> Plane:
-        # On a steep surface a pixel aside is much nearer or further.
+    def _deepest_around(self) -> Plane:  # on a steep surface a pixel aside is much nearer or further
         return cv2.erode(self.inverse_depth, np.ones((3, 3), np.uint8))
 
     def sees(self, points: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -49,9 +49,8 @@ _ITERATIONS = 20
 _ASKED, _FRAMES_ASKED = 4, 6
 """Keyframes between two questions whether an object is a surface of revolution, and frames between two questions
 whether it still is (chosen)."""
-_LANDMARK_PRIOR = (
-    0.05  # cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
-)
+# Cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
+_LANDMARK_PRIOR = 0.05
 _SCALE = 1.0  # pixels
 
 

@@ -337,13 +337,12 @@ def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
 
     What moves with the object next to its mask is then a hand.
     """
-    for position, view in enumerate(object_map.keyframes):
-        if viewing_angle(view.pose, pose) < _SAME_DIRECTION and any(
-            viewing_angle(view.pose, later.pose) > _MIN_ROTATION
-            for later in object_map.keyframes[position + 1 :]
-        ):
-            return True
-    return False
+    poses = [view.pose for view in object_map.keyframes]
+    return any(
+        viewing_angle(one, pose) < _SAME_DIRECTION
+        and any(viewing_angle(one, later) > _MIN_ROTATION for later in poses[position + 1 :])
+        for position, one in enumerate(poses)
+    )
 
 
 def remember_motion(

@@ -35,7 +35,6 @@ from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
-
 _MOST_ELSEWHERE = 60
 """Inliers from which on the whole frame is not searched: it would have to yield more (34 to 50 on cube_in_hand)."""
 
@@ -116,13 +115,8 @@ class Tracker:
         self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
         """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
-        where = relocalize_in_frame(
-            state.object_map,
-            state.camera,
-            image,
-            (state.trajectory or (state.last_pose,))[-1][0],
-            self.observer.detector,
-        )
+        last, _ = (state.trajectory or (state.last_pose,))[-1]
+        where = relocalize_in_frame(state.object_map, state.camera, image, last, self.observer.detector)
         if where is None:
             return None
         pose, points = where

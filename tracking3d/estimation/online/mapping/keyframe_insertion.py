@@ -114,10 +114,8 @@ def insert_keyframe(
 ) -> tuple[ObjectMap, FollowedPoints]:
     """The map with a view as a new keyframe, refined over the local window, and the points to track from it."""
     object_map, view = insert_points(object_map, camera, view, image, detector)
-    drawn, filmed = (
-        object_map.keyframes[: object_map.fixed_keyframes],
-        (*object_map.keyframes[object_map.fixed_keyframes :], view),
-    )
+    drawn = object_map.keyframes[: object_map.fixed_keyframes]
+    filmed = (*object_map.keyframes[object_map.fixed_keyframes :], view)
     object_map = replace(object_map, keyframes=(*drawn, *cull_keyframes(filmed, config.max_keyframes)))
     window = window_of(len(object_map.keyframes), config.local_window)
     object_map = refine_local_map(object_map, camera, window, config, bundle_iterations=10, rounds=1)
@@ -258,10 +256,8 @@ def draw_keyframes(object_map: ObjectMap, camera: Camera, positions: list[int]) 
 MOST_CANDIDATES = 100
 _BAND_WIDTH = 0.25  # width of the band around the mask, relative to the root of its area
 _VIEWS = 3
-_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
-    1.0,
-    2.5,
-)  # mean residual in pixels at an object size of 200 pixels
+# Mean residual in pixels at an object size of 200 pixels
+_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = 1.0, 2.5
 _MIN_MOTION = 6.0  # such pixels
 _MIN_ROTATION = 12.0
 """Degrees by which an object that rested at first must have been seen to turn while a candidate was tracked: a thing on
@@ -269,10 +265,8 @@ a table turns less, if a hand touches it or the camera moves in a hand, and then
 _MAX_STATIC_MOTION = 0.3  # share of the motion that the object would have caused
 _SECTORS = 8  # directions into which the surroundings are divided
 _STATIC_SHARE = 0.6  # share of a sector's candidates, and of the sectors, that fit if the scene is static
-_MIN_SECTORS, _MIN_CANDIDATES = (
-    5,
-    3,
-)  # fewest sectors that can be tested, and fewest candidates of such a sector
+# Fewest sectors that can be tested, and fewest candidates of such a sector
+_MIN_SECTORS, _MIN_CANDIDATES = 5, 3
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

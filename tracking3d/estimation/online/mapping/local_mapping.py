@@ -137,11 +137,7 @@ def with_landmarks(
     fresh = np.flatnonzero(label < 0)
     # Two keypoints at one pixel are one landmark.
     pixels = np.concatenate([keypoints.pixel[fresh], corners])
-    points, met = (
-        lift_pixels(object_map, camera, view, pixels)
-        if len(pixels)
-        else (np.zeros((0, 3)), np.zeros(0, bool))
-    )
+    points, met = lift_pixels(object_map, camera, view, pixels)
     names = np.full(len(pixels), -1, np.int64)
     names[met] = len(object_map.landmarks) + np.arange(met.sum())
     landmarks = np.concatenate([object_map.landmarks, points[met]])
