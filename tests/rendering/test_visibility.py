@@ -13,7 +13,7 @@ from render_oracle import cast_rays, certain
 from scenes import Scene, bumpy_sphere, rounded, triangles
 from scipy.ndimage import binary_fill_holes
 
-from tracking3d.rendering import Visibility, rasterize
+from tracking3d.rendering import Visibility, nearest_depth, rasterize
 
 
 def seen(scene: Scene) -> Visibility:
@@ -90,6 +90,10 @@ def test_one_view_is_seen_as_among_others(by):
         alone = seen(replace(scene, screen=scene.screen[one], depth=scene.depth[one]))
         assert torch.equal(alone.face_index, together.face_index[one])
         assert torch.equal(alone.depth, together.depth[one])
+        by_itself = nearest_depth(
+            scene.screen[view], scene.depth[view], scene.faces, scene.size, scene.backend
+        )
+        assert torch.equal(by_itself, together.depth[view])
 
 
 @everywhere
