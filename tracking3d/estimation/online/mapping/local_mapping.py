@@ -50,8 +50,8 @@ def lift_pixels(
     screen, depth = project_vertices(
         object_map.vertices, view.pose.R[None], view.pose.translation[None], K[None]
     )
-    drawn = nearest_depth(screen[0], depth[0], object_map.shape.faces, (size, size), object_map.renderer)
-    drawn = drawn.cpu().numpy()
+    plane = nearest_depth(screen[0], depth[0], object_map.shape.faces, (size, size), object_map.renderer)
+    drawn = plane.cpu().numpy()
     in_window = (to_window(view, pixel) + 0.5) * finer - 0.5
     column, row = np.clip(np.rint(in_window), 0, size - 1).astype(int).T
     inside = (np.abs(in_window - (size - 1) / 2) <= size / 2).all(1)
