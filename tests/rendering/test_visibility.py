@@ -13,7 +13,8 @@ from render_oracle import cast_rays, certain
 from scenes import Scene, bumpy_sphere, rounded, triangles
 from scipy.ndimage import binary_fill_holes
 
-from tracking3d.rendering import Visibility, nearest_depth, rasterize
+from tracking3d.rendering import Visibility, rasterize
+from tracking3d.rendering.visibility import nearest_depth
 
 
 def seen(scene: Scene) -> Visibility:

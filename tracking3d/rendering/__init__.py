@@ -24,7 +24,7 @@ from tracking3d.rendering.silhouette import soft_silhouette
 from tracking3d.rendering.surface import Surface, sample_texture
 from tracking3d.rendering.surface_visibility import visible_texels, visible_vertices
 from tracking3d.rendering.texture_losses import channels_last, texture_losses
-from tracking3d.rendering.visibility import Visibility, nearest_depth, rasterize
+from tracking3d.rendering.visibility import Visibility, rasterize
 
 __all__ = [
     "BackProjection",
@@ -47,7 +47,6 @@ __all__ = [
     "contour_normal_equations",
     "find_contour",
     "interpolate",
-    "nearest_depth",
     "pose_normal_equations",
     "pose_terms",
     "prepare_backend",

@@ -22,8 +22,8 @@ from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks, adjust
-from tracking3d.rendering import nearest_depth
 from tracking3d.rendering import project as project_vertices
+from tracking3d.rendering.visibility import nearest_depth
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is the same as a tracked point

@@ -21,7 +21,8 @@ from tracking3d.estimation.shape import Shape, visible_texture
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.points.landmark_adjustment import LandmarkScene
-from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, nearest_depth, project
+from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project
+from tracking3d.rendering.visibility import nearest_depth
 from tracking3d.scene.view import FrameCrop
 
 
