@@ -34,17 +34,17 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14350,  # kernels of the joint fit: a start without points takes half its time
+    "estimation": 14300,  # kernels of the joint fit: a start without points takes half its time
     "export": 2750,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
-    "geometry": 2000,
+    "geometry": 2050,  # poses keep their matrices
     "modules": 450,
     "pipeline": 6800,  # the budget of what is tried when frames are lost; shapes get the memory of what tracked
     "plugins": 850,  # the group of keypoint detectors
     "points": 3600,
     "reconstruction": 3900,  # total variation in a kernel
-    "rendering": 3800,
+    "rendering": 3850,  # depth without faces
     "results": 6900,
     "runtime": 1150,
     "scene": 350,

@@ -93,7 +93,7 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
         exact = truth.masks[observation.index].read() if observation.index in truth.masks else None
         asked = exact is not None and initial is not None and exact.any()
         if asked and max(_overlap(initial, exact), _overlap(rendered, exact)) >= _LEAST_OVERLAP:
-            window, image = upsampled_window(observation)
+            window, image, _ = upsampled_window(observation)
             masks = [mask_in_window(mask, window) for mask in (initial, rendered, exact)]
             found = pixel_features(as_lab(image), *masks[:2], confidence, colours)
             chosen = sampled(found, observation.index)

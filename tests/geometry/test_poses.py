@@ -62,6 +62,12 @@ def test_the_matrix_maps_object_to_camera_coordinates():
     assert x_cam.tolist() == pytest.approx([1.0, 3.0, 3.0, 1.0])
 
 
+def test_who_changes_a_matrix_does_not_change_the_pose():
+    one = pose([0.0, 0.0, 90.0], [1.0, 2.0, 3.0])
+    one.matrix()[:] = 0
+    assert one.matrix()[:3, 3].tolist() == [1.0, 2.0, 3.0]
+
+
 def test_the_matrix_is_float64_whatever_the_pose():
     one = Pose(torch.ones(3, requires_grad=True), torch.tensor([1.0, 0, 0, 0], requires_grad=True))
     assert one.matrix().dtype == torch.float64 and not one.matrix().requires_grad

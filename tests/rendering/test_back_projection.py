@@ -72,19 +72,6 @@ def test_the_far_side_is_not_painted_through():
     assert picked.isfinite().all()
 
 
-def test_back_projection_is_the_same_to_the_last_digit_with_every_backend():
-    scene = bumpy_sphere((96, 96), views=1, frequency=8)
-    vertices, uvs, R, t, K = (
-        one.float() for one in (scene.vertices, scene.face_uvs, scene.R, scene.t, scene.K)
-    )
-    texels, image = TexelMap.of(uvs, 32), torch.rand(3, 96, 96)
-    fast, plain = (
-        back_project(image, image[0], vertices, scene.faces, texels, R[0], t[0], K[0], backend)
-        for backend in ("numba", "torch")
-    )
-    assert torch.equal(fast.total, plain.total) and torch.equal(fast.weight, plain.weight)
-
-
 def test_the_kernel_sees_what_torch_sees():
     scene = bumpy_sphere((96, 96), views=3, frequency=8)
     vertices, uvs, R, t, K = (

@@ -14,6 +14,7 @@ from scenes import Scene, bumpy_sphere, rounded, triangles
 from scipy.ndimage import binary_fill_holes
 
 from tracking3d.rendering import Visibility, rasterize
+from tracking3d.rendering.visibility import nearest_depth
 
 
 def seen(scene: Scene) -> Visibility:
@@ -90,6 +91,10 @@ def test_one_view_is_seen_as_among_others(by):
         alone = seen(replace(scene, screen=scene.screen[one], depth=scene.depth[one]))
         assert torch.equal(alone.face_index, together.face_index[one])
         assert torch.equal(alone.depth, together.depth[one])
+        by_itself = nearest_depth(
+            scene.screen[view], scene.depth[view], scene.faces, scene.size, scene.backend
+        )
+        assert torch.equal(by_itself, together.depth[view])
 
 
 @everywhere

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,15 +18,10 @@ from torch.nn import functional
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """One pose, or a batch of them.
+    """One pose, or a batch of them."""
 
-    Attributes:
-        translation: ``(..., 3)``.
-        quaternion: ``(..., 4)``, w first, unit length.
-    """
-
-    translation: Tensor
-    quaternion: Tensor
+    translation: Tensor  # (..., 3)
+    quaternion: Tensor  # (..., 4), w first, unit length
 
     @classmethod
     def identity(cls, translation: Tensor) -> Pose:
@@ -51,7 +47,7 @@ class Pose:
     def R(self) -> Tensor:
         """``(..., 3, 3)`` rotation matrix."""
         if is_single(self.quaternion, 1):
-            return matrix_of(self.quaternion)
+            return self._single_R
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
         result: Tensor = quaternion_to_rotation_matrix(self.quaternion)
@@ -59,10 +55,25 @@ class Pose:
 
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 ``T_cam_obj`` of a single pose, on the CPU."""
-        pose = Pose(self.translation.detach().double().cpu(), self.quaternion.detach().double().cpu())
+        return self._single_matrix.clone()
+
+    # A pose of the map is asked for these in every frame.
+    @cached_property
+    def viewing_direction(self) -> NDArray[np.float64]:
+        """``(3,)`` unit vector from the object's origin to the camera, in object coordinates, of a single pose."""
+        R, t = pose_arrays(self)
+        direction = -R.T @ t
+        return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
+    @cached_property
+    def _single_R(self) -> Tensor:
+        return matrix_of(self.quaternion)
+
+    @cached_property
+    def _single_matrix(self) -> Tensor:
         T_cam_obj = torch.eye(4, dtype=torch.float64)
-        T_cam_obj[:3, :3] = pose.R
-        T_cam_obj[:3, 3] = pose.translation
+        T_cam_obj[:3, :3] = Pose(self.translation, self.quaternion.detach().double().cpu()).R
+        T_cam_obj[:3, 3] = self.translation.detach()
         return T_cam_obj
 
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
@@ -39,9 +40,8 @@ DEVIATION = 0.1
 """Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
-_LEAST_SUPPORT = (
-    60  # points in half of the views; with fewer, adjusted poses were wrong more often than right
-)
+# Points in half of the views; with fewer, adjusted poses were wrong more often than right
+_LEAST_SUPPORT = 60
 _SETTLED, _TO_COME = np.deg2rad(0.01), np.deg2rad(0.05)
 """Turn of a round that ends them, and what may still be to come if turns go on to shrink as they did. Of an object with
 faint texture a round leaves .8 to .9 of an error, so that five to ten times as much is; of others a few tenths."""
@@ -77,7 +77,7 @@ class LandmarkScene:
     may_reverse: bool = False
     reversal: Reversal | None = None  # what was done to surface and poses, where landmarks said that it was
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Half the diagonal of the object's box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0))) / 2
@@ -344,6 +344,10 @@ def seeds(view: Drawn, vertices: Array, faces: NDArray[np.int64]) -> Corners:
     return face[on], barycentric[on], xy[on]
 
 
+SYMMETRIC: Mapping[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}
+}  # fmt: skip
+"""Of `scipy.sparse.linalg.splu`, for a factorization that keeps the symmetry of positive equations."""
 _STAY = 1e-3  # weight that holds every vertex, so that there is one answer
 
 
@@ -388,7 +392,7 @@ def move_surface(
         + stiffness * (laplacian.T @ laplacian)
         + _STAY * sparse.eye(len(vertices))
     )
-    moved: Array = vertices + spsolve(H.tocsc(), on.T @ (weight[:, None] * gap))
+    moved: Array = vertices + splu(H.tocsc(), **SYMMETRIC).solve(on.T @ (weight[:, None] * gap))
     return moved
 
 
@@ -408,9 +412,8 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Arr
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """
-    share = 0.0
+    share, others = 0.0, [scene.views[index] for index in known]
     for turn in range(TURNS):
-        others = [scene.views[index] for index in known]
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
             _carry_tracks(scene, warps, source, index)

@@ -29,11 +29,8 @@ KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
 assert max(STEPS) <= KEPT
 _GRID = 8  # along either side of the window
-_SETTLING = (
-    1.0,
-    0.3,
-    0.1,
-)  # pixels that a measurement is off at best: first all have a say, then those that agree
+# Pixels that a measurement is off at best: first all have a say, then those that agree
+_SETTLING = 1.0, 0.3, 0.1
 _HELD = 0.1  # deviation of the points from the surface, in radii
 
 Known = Callable[[int], tuple[Camera, Array] | None]

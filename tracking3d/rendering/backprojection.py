@@ -20,7 +20,7 @@ from torch.nn import functional
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.interpolation import barycentrics
 from tracking3d.rendering.renderer import project
-from tracking3d.rendering.visibility import rasterize
+from tracking3d.rendering.visibility import nearest_depth, rasterize
 
 _DEPTH_TOLERANCE = 0.02
 """A texel is hidden if something is nearer by more than this share of the mesh's radius."""
@@ -99,11 +99,8 @@ def back_project(
     K: Tensor,
     backend: str = "auto",
 ) -> BackProjection:
-    """What one frame shows of the texture; see `seen_texels` for the arguments.
-
-    Solvers go on from it: it is torch's to the last digit with every backend.
-    """
-    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend, by_kernel=False)
+    """What one frame shows of the texture; see `seen_texels` for the arguments."""
+    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend)
     size = texels.size
     total = values.new_zeros(values.shape[0], size * size)
     total[:, seen.texel] = seen.values * seen.weight
@@ -123,7 +120,6 @@ def seen_texels(
     t: Tensor,
     K: Tensor,
     backend: str = "auto",
-    by_kernel: bool = True,
 ) -> SeenTexels:
     """The texels that one frame shows.
 
@@ -136,11 +132,10 @@ def seen_texels(
         R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
         K: ``(3, 3)`` of the window.
         backend: See `tracking3d.rendering.backend`.
-        by_kernel: Whether texels may be looked up by the kernel, if that is the backend: it rounds otherwise.
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])
-    drawn = rasterize(screen, depth, faces, (height, width), backend).depth
+    drawn = nearest_depth(screen[0], depth[0], faces, (height, width), backend)
     x_cam = vertices @ R.T + t
     corner = x_cam[faces]
     normal = functional.normalize(
@@ -149,13 +144,13 @@ def seen_texels(
     # A face that turns away from all of its corners shows no texel: most of a large atlas is left out so.
     facing = ((corner * normal[:, None]).sum(2) < 0).any(1)
     radius = (vertices - vertices.mean(0)).norm(dim=1).max()
-    if by_kernel and use_numba(backend, values, valid, vertices, texels.barycentric):
+    if use_numba(backend, values, valid, vertices, texels.barycentric):
         from tracking3d.rendering.kernels import backprojection
 
         atlas = texels.texel, texels.face, texels.barycentric
         tolerance = _DEPTH_TOLERANCE * float(radius)
         seen = backprojection.seen_texels(
-            values, valid, drawn[0], corner, normal, facing, atlas, K, _GRAZING, tolerance
+            values, valid, drawn, corner, normal, facing, atlas, K, _GRAZING, tolerance
         )
         return SeenTexels(*seen)
     front = torch.nonzero(facing[texels.face])[:, 0]
@@ -168,7 +163,7 @@ def seen_texels(
     pixel = torch.stack([K[0, 0], K[1, 1]]) * point[:, :2] / point[:, 2:] + K[:2, 2]
     grid = ((2 * pixel + 1) / pixel.new_tensor([width, height]) - 1)[None, None]
     nearest = functional.grid_sample(
-        torch.where(drawn.isinf(), 0.0, drawn)[None], grid, mode="nearest", align_corners=False
+        torch.where(drawn.isinf(), 0.0, drawn)[None, None], grid, mode="nearest", align_corners=False
     )[0, 0, 0]
     visible = (nearest > 0) & (point[:, 2] < nearest + _DEPTH_TOLERANCE * radius / cosine)
     layers = torch.cat([values, valid[None]])

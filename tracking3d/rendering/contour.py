@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.geometry.camera import NEAR
+from tracking3d.geometry.camera import NEAR, pixel_distance
 from tracking3d.rendering.normal_equations import NormalEquations, screen_motion
 from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.surface import check_shapes, edges_of
@@ -134,15 +133,13 @@ def signed_distance(mask: Tensor) -> Tensor:
     """``(B, H, W)`` distance in pixels to the outline of ``mask`` ``(B, H, W)``, negative inside.
 
     The outline runs half-way between pixels inside (above 0.5) and pixels outside. A mask without an outline in the
-    window gives zeros, which pull nowhere. SciPy's exact transform; the mask is not differentiated.
+    window gives zeros, which pull nowhere. The mask is not differentiated.
     """
     inside = (mask > 0.5).cpu().numpy()
-    result = np.zeros(inside.shape)
+    result = np.zeros(inside.shape, np.float32)
     for view, part in enumerate(inside):
         if part.any() and not part.all():
-            outward = distance_transform_edt(~part) - 0.5
-            inward = distance_transform_edt(part) - 0.5
-            result[view] = np.where(part, -inward, outward)
+            result[view] = np.where(part, 0.5 - pixel_distance(~part), pixel_distance(part) - 0.5)
     return torch.from_numpy(result).to(mask)
 
 

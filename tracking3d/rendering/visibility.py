@@ -105,6 +105,19 @@ def rasterize(
     return Visibility(face_index.reshape(shape), nearest.reciprocal().reshape(shape), covered)
 
 
+@torch.no_grad()
+def nearest_depth(
+    screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], backend: str = "auto"
+) -> Tensor:
+    """``(H, W)`` `Visibility.depth` of one view, ``(V, 2)`` and ``(V,)``: a third of the time, if no face is asked."""
+    if use_numba(backend, screen, depth):
+        from tracking3d.rendering.kernels import visibility
+
+        check_shapes(screen=(screen, "V 2"), depth=(depth, "V"), faces=(faces, "F 3"))
+        return visibility.nearest_depth(screen, depth, faces, size, NEAR)
+    return rasterize(screen[None], depth[None], faces, size, backend).depth[0]
+
+
 def _boxes_in_front(
     screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:

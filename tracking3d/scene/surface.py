@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.rendering.visibility import rasterize
+from tracking3d.rendering.visibility import nearest_depth
 from tracking3d.scene.view import Array, Mask, ObjectView, Plane, project_points
 
 _MOST_AT_ONCE = 2**14  # pixels that OpenCV looks up in one call
@@ -46,6 +46,10 @@ class Drawn(ObjectView):
             cosine = np.abs((normal * ray).sum(1)) / length
         return np.where(np.isfinite(cosine) & (sample(self.beyond, xy) < 0.5), cosine, 0.0)
 
+    @cached_property
+    def _deepest_around(self) -> Plane:  # on a steep surface a pixel aside is much nearer or further
+        return cv2.erode(self.inverse_depth, np.ones((3, 3), np.uint8))
+
     def sees(self, points: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
         """Where object points are, and which of them the surface does not hide and the window holds.
 
@@ -60,9 +64,7 @@ class Drawn(ObjectView):
         height, width = self.window.shape
         with np.errstate(invalid="ignore"):
             inside = ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(1)
-        # The deepest around: on a steep surface a pixel aside is much nearer or further.
-        around = cv2.erode(self.inverse_depth, np.ones((3, 3), np.uint8))
-        drawn = sample(around, xy).astype(np.float64)
+        drawn = sample(self._deepest_around, xy).astype(np.float64)
         near = inside & (drawn > 0) & (sample(self.beyond, xy) < 3)
         with np.errstate(invalid="ignore", divide="ignore"):
             return xy, near & (depth < 1 / drawn + tolerance)
@@ -106,12 +108,12 @@ def draw_depth(
     Without a pose, or where nothing is seen of the surface, the first is 0 and the second more than any distance.
     """
     screen, depth = project_points(vertices, K, T_cam_obj)
-    drawn = rasterize(
-        torch.tensor(np.nan_to_num(screen, nan=-1e6), dtype=torch.float32)[None],
-        torch.tensor(depth, dtype=torch.float32)[None],
+    drawn = nearest_depth(
+        torch.from_numpy(np.nan_to_num(screen, nan=-1e6).astype(np.float32)),
+        torch.from_numpy(depth.astype(np.float32)),
         torch.tensor(faces),
         size,
-    ).depth[0].numpy()  # fmt: skip
+    ).numpy()
     covered = np.asarray(np.isfinite(drawn))
     if not covered.any():
         return np.zeros(size, np.float32), np.full(size, sum(size), np.float32)

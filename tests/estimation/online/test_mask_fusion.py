@@ -92,7 +92,7 @@ def test_an_empty_silhouette_beside_a_mask_is_no_traceback():
 
 def test_the_window_is_seen_at_twice_its_pixels():
     observation = observed(TRUTH, TRUTH)
-    window, image = upsampled_window(observation)
+    window, image, _ = upsampled_window(observation)
     assert image.shape == (256, 256, 3)
     assert (window.size, window.side) == (256, observation.window.side)
     assert image[128, 128, 0] > 150 > image[2, 128, 0]
@@ -117,7 +117,7 @@ def test_a_doubted_pose_redraws_nothing(confidence, cue):
     seen = observed(TRUTH, initial)
 
     def moving():
-        window, _ = upsampled_window(seen)
+        window, _, _ = upsampled_window(seen)
         return np.full((window.size, window.size), cue, np.float32)
 
     found = fuse_mask(rendered, initial, seen, confidence, None, None if cue is None else moving)
@@ -131,7 +131,7 @@ def test_what_moves_with_the_object_is_added_however_much_the_pose_is_doubted():
     seen = observed(TRUTH, initial)
 
     def moving():
-        window, _ = upsampled_window(seen)
+        window, _, _ = upsampled_window(seen)
         return np.where(mask_in_window(TRUTH, window), 1, -1).astype(np.float32)
 
     found = fuse_mask(TRUTH, initial, seen, 0.1, None, moving)

@@ -69,7 +69,7 @@ def test_of_a_side_that_comes_again_nothing_beside_is_new(state, monkeypatch):
     monkeypatch.setattr(masks, "is_seen_again", lambda object_map, pose: True)
     seen = found(state)
     told = motion_cue_in_window(state, seen, IMAGE)
-    window, _ = upsampled_window(seen.view.observation)
+    window, _, _ = upsampled_window(seen.view.observation)
     inside = mask_in_window(
         seen.view.mask | state.object_map.silhouette(seen.view.pose, state.camera), window
     )

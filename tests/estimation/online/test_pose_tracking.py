@@ -169,7 +169,7 @@ def test_a_mask_that_is_not_believed_does_not_pull(object_map, surface):
 def test_a_grid_of_rotations_finds_what_a_small_step_does_not(surface):
     view = turned_map([-20.0]).keyframes[0]
     best = search_rotations(surface, view, turned(20), PoseWeights())
-    assert len(best) == 5
+    assert len(best) == 2
     assert min(degrees_apart(pose, turned(-20)) for pose in best) < 8
 
 

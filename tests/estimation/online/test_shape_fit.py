@@ -19,6 +19,7 @@ from rendered_solids import (
     shape_of,
     silhouettes,
 )
+from scipy import sparse
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
@@ -31,6 +32,7 @@ from tracking3d.estimation.online.optimization.shape_fit import (
     _covered_rows,
     _faces_before,
     _outline_rows,
+    _solve,
     fit_surface,
 )
 from tracking3d.geometry.pose import Pose
@@ -326,3 +328,13 @@ def test_a_landmark_before_the_surface_is_as_far_from_it_as_from_the_plane_of_it
         FitWeights(landmarks=1.0, landmarks_scale=10.0),
     )
     assert found * 10 == pytest.approx([-0.01], rel=1e-3)
+
+
+@pytest.mark.parametrize("stiff", [1.0, 1e4])
+def test_single_precision_costs_no_digits(stiff):
+    random = np.random.default_rng(0)
+    rows = sparse.random(900, 300, 0.02, random_state=0)
+    matrix = (rows.T @ rows + stiff * sparse.diags(random.random(300) + 0.01)).tocsr()
+    exact = random.normal(size=300)
+    floor = 1e-6 * matrix.diagonal().max()
+    np.testing.assert_allclose(_solve(matrix, matrix @ exact + floor * exact), exact, rtol=1e-5, atol=1e-5)

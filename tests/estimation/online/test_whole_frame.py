@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_mask, whole_run
 
-from tracking3d.estimation.estimate import RELOCALIZED, MaskSource, Status, corrects
+from tracking3d.estimation.estimate import RELOCALIZED, Assessment, MaskSource, Status, corrects
+from tracking3d.estimation.online import tracker
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.relocalization import overlaps_mask, relocalize_in_frame
 from tracking3d.frames import Frame
@@ -55,6 +56,22 @@ def test_what_comes_back_elsewhere_is_found_while_the_mask_clings_to_the_wall(fr
     assert not back.keyframe and state.lost_frames == 0
     _, after = solver().step(state, Frame(index + 1, image), estimate_of(mask))
     assert after.status is Status.TRACKED and mask_iou(after.mask, mask) > 0.9
+
+
+@pytest.mark.parametrize(("most", "searched"), [(0, False), (10**6, True)])
+def test_a_doubtful_pose_with_more_points_than_a_search_finds_is_not_searched_for(
+    monkeypatch, most, searched
+):
+    state, _ = whole_run()
+    last, index = state.last_pose
+    view = replace(state.object_map.keyframes[-1], pose=last)
+    asked = []
+    monkeypatch.setattr(tracker, "_MOST_ELSEWHERE", most)
+    monkeypatch.setattr(tracker, "assess_pose", lambda *_: Assessment(Status.UNCERTAIN, "", 0.1))
+    monkeypatch.setattr(tracker.Tracker, "_elsewhere", lambda *_: asked.append(1))
+    shown = frame(view.index)
+    solver().tracker.find(state, view, replace(shown, index=index + 1), grey(shown.image), {"last": last})
+    assert bool(asked) == searched
 
 
 def test_where_it_is_not_nothing_is_found():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,16 +226,18 @@ def fuse_mask(
         return FusedMask(rendered, MaskSource.RENDERED)
     if initial_weight == 1:
         return FusedMask(initial, MaskSource.INITIAL)
-    window, image = upsampled_window(observation)
-    lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
+    window, image, lab = upsampled_window(observation)
+    own, drawn = mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
     told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     odds, asked = blend_with_initial(odds, own, 1 - initial_weight), smoothing_of(initial_weight) * asked
-    support = _extract(image, odds, asked, initial, window)
-    share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
+    share = 0.0
+    if told is not None:
+        support = _extract(image, odds, asked, initial, window)
+        share = motion_supported_share(support > 0, own, told)
     if not share:  # nothing but the silhouette speaks against the initial mask
         if not pose_weight(confidence):
             return FusedMask(initial, MaskSource.INITIAL)
@@ -266,16 +269,17 @@ def update_colours(
     colours: ColourModels | None, observation: Observation, mask: NDArray[np.bool_]
 ) -> ColourModels | None:
     """The colour models after a frame with ``mask`` ``(H, W)``; what is in front of the object is left out."""
-    window, image = upsampled_window(observation)
-    covered = occluder_in_window(observation)
-    return ColourModels.of(as_lab(image), mask_in_window(mask, window), colours, covered)
+    window, _, lab = upsampled_window(observation)
+    return ColourModels.of(lab, mask_in_window(mask, window), colours, occluder_in_window(observation))
 
 
-def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
-    """The window upsampled to side ``S``, and its image ``(S, S, 3)`` RGB."""
+@lru_cache(maxsize=1)  # of the frame at hand: it is asked for three times
+def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8], NDArray[np.uint8]]:
+    """The window upsampled to side ``S``, and its image ``(S, S, 3)``, RGB and Lab."""
     window = replace(observation.window, size=_UPSAMPLING * observation.window.size)
     image = (255 * observation.image.permute(1, 2, 0)).round().clamp(0, 255).cpu().numpy()
-    return window, np.ascontiguousarray(image.astype(np.uint8))
+    image = np.ascontiguousarray(image.astype(np.uint8))
+    return window, image, as_lab(image)
 
 
 def occluder_in_window(observation: Observation) -> NDArray[np.bool_] | None:
@@ -319,7 +323,7 @@ def motion_cue_in_window(
         return None
     here = MotionReference.of(image, taken, pose.matrix().numpy())
     vertices = object_map.vertices.double().cpu().numpy()
-    window, _ = upsampled_window(found.view.observation)
+    window, _, _ = upsampled_window(found.view.observation)
     moving = online_motion_log_odds(
         here, state.motion_references, window, state.camera, vertices, object_map.shape.faces.cpu().numpy()
     )
@@ -333,13 +337,12 @@ def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
 
     What moves with the object next to its mask is then a hand.
     """
-    for position, view in enumerate(object_map.keyframes):
-        if viewing_angle(view.pose, pose) < _SAME_DIRECTION and any(
-            viewing_angle(view.pose, later.pose) > _MIN_ROTATION
-            for later in object_map.keyframes[position + 1 :]
-        ):
-            return True
-    return False
+    poses = [view.pose for view in object_map.keyframes]
+    return any(
+        viewing_angle(one, pose) < _SAME_DIRECTION
+        and any(viewing_angle(one, later) > _MIN_ROTATION for later in poses[position + 1 :])
+        for position, one in enumerate(poses)
+    )
 
 
 def remember_motion(

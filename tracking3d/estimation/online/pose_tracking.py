@@ -33,14 +33,10 @@ ENOUGH_MATURE = 30
 _MIN_INLIERS = 6  # fewest points of a pose by PnP
 _MAX_INLIER_ERROR = 3.0  # largest reprojection error of an inlier, in pixels at an object size of 200 pixels
 _OUTLINE_MARGIN = 8.0  # such pixels from the outline within which points slide over the surface
-_MAX_REPROJECTION_ERROR, _MAX_REPROJECTION_ERROR_NEW = (
-    4.0,
-    16.0,
-)  # such pixels, beyond which a point is an outlier
-_INLIER_REWARD, _MAX_REWARDED_INLIERS = (
-    0.005,
-    30,
-)  # taken off the cost for each inlier, and for how many at most
+# Such pixels, beyond which a point is an outlier
+_MAX_REPROJECTION_ERROR, _MAX_REPROJECTION_ERROR_NEW = 4.0, 16.0
+# Taken off the cost for each inlier, and for how many at most
+_INLIER_REWARD, _MAX_REWARDED_INLIERS = 0.005, 30
 
 
 def pixel_scale(view: Keyframe) -> float:

@@ -36,7 +36,7 @@ from tracking3d.rendering import Surface
 ROTATION_SEARCH = "rotation_search"
 """The name of the hypothesis that is the best of many rotations around the predicted pose."""
 _GRID_ANGLES = (20.0, 40.0)
-_GRID_FINALISTS = 5
+_GRID_FINALISTS, _GRID_KEPT = 5, 2
 _RETRY_INTERVAL = 5  # frames after a loss with a search in each; later, only every n-th frame
 _MAX_ALIGNED_KEYFRAMES = 8  # most keyframes whose poses are tried for a lost object
 
@@ -67,7 +67,8 @@ def search_rotations(surface: Surface, view: Keyframe, pose: Pose, weights: Pose
     costs = [fit.cost for fit in refine_poses(surface, small, poses, None, weights, (0,))]
     best = np.argsort(np.nan_to_num(costs, nan=math.inf))[:_GRID_FINALISTS]
     finalists = [poses[place] for place in best]
-    return [fit.pose for fit in refine_poses(surface, small, finalists, None, weights, (4,))]
+    refined = refine_poses(surface, small, finalists, None, weights, (4,))
+    return [fit.pose for fit in sorted(refined, key=lambda one: one.cost)[:_GRID_KEPT]]
 
 
 def should_retry(frames: int) -> bool:

@@ -35,6 +35,9 @@ from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
+_MOST_ELSEWHERE = 60
+"""Inliers from which on the whole frame is not searched: it would have to yield more (34 to 50 on cube_in_hand)."""
+
 
 @dataclass(frozen=True)
 class Tracker:
@@ -90,7 +93,8 @@ class Tracker:
         if object_map.free_axis is not None:
             fit = replace(fit, pose=object_map.free_axis.untwisted(fit.pose, state.last_pose[0]))
         best = PoseCandidate(view, fit, won, kept, support, assessment)
-        if best.lost or (best.doubtful and not again and should_retry(state.doubtful_frames)):
+        unsure = best.doubtful and best.evidence.inliers < _MOST_ELSEWHERE
+        if best.lost or (unsure and not again and should_retry(state.doubtful_frames)):
             other = self._elsewhere(state, frame, image, view.mask)
             return other if other is not None and other.better_than(best) else best
         return best
@@ -115,13 +119,8 @@ class Tracker:
         self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
         """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
-        where = relocalize_in_frame(
-            state.object_map,
-            state.camera,
-            image,
-            (state.trajectory or (state.last_pose,))[-1][0],
-            self.observer.detector,
-        )
+        last, _ = (state.trajectory or (state.last_pose,))[-1]
+        where = relocalize_in_frame(state.object_map, state.camera, image, last, self.observer.detector)
         if where is None:
             return None
         pose, points = where

@@ -59,7 +59,7 @@ def pixel_features(
     shapes += [relative_confidence(confidence) * one for one in shapes]
     # Colours are those on either side of where the shapes put the outline.
     likely = np.tensordot(_BY_SHAPE, np.stack(shapes), 1) > 0
-    nearby = beside_outline(lab, likely) if likely.any() else np.zeros(likely.shape, np.float32)
+    nearby = beside_outline(lab, likely, few=True) if likely.any() else np.zeros(likely.shape, np.float32)
     remembered = np.zeros_like(nearby) if colours is None else colours.log_ratio(lab)
     asked = _query_share(shapes[_INITIAL], shapes[_RENDERED])
     return np.stack([*shapes, asked * nearby, asked * remembered], -1).astype(np.float32)

@@ -36,6 +36,14 @@ def rasterize(
     return face_index, drawn, pixels
 
 
+def nearest_depth(screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], near: float) -> Tensor:
+    """``(H, W)``, see `tracking3d.rendering.visibility.nearest_depth`."""
+    check_corners(faces, screen[None])
+    drawn = np.zeros(size, np.float32)
+    _nearest_depth(array(screen), array(depth), array(faces), near, np.empty(size, np.int32), drawn)
+    return torch.from_numpy(drawn)
+
+
 @numba.njit(inline="always", **OPTIONS)
 def _edge(corners, start, end):
     """Where an edge begins, and its direction; it begins at its end of lower index, whichever face asks."""
@@ -114,3 +122,11 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, fi
         counts[view] = covered
         for pixel in range(height * width):
             flat[pixel] = one / flat[pixel]
+
+
+@kernel("void(float32[:,::1], float32[::1], int64[:,::1], float64, int32[:,::1], float32[:,::1])")
+def _nearest_depth(screen, depth, faces, near, winner, drawn):
+    draw_view(screen, depth, faces, np.float32(near), winner, drawn)
+    flat, one = drawn.reshape(-1), np.float32(1)
+    for pixel in range(flat.size):
+        flat[pixel] = one / flat[pixel]

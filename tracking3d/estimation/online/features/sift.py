@@ -16,9 +16,8 @@ from tracking3d.features.protocol import Keypoints as Keypoints
 _MAX_KEYPOINTS = 250  # most keypoints of a frame
 _CONTRAST = 0.02  # half of OpenCV's default, for the faint texture of small objects
 _SIZE = 200  # length in pixels to which the object's longer side is scaled
-_SMALLEST = (
-    100  # pixels; the longer side is scaled up as if it had at least so many, and down by the same factor
-)
+# Pixels; the longer side is scaled up as if it had at least so many, and down by the same factor
+_SMALLEST = 100
 _BORDER = 8  # pixels around the object that descriptors may use
 _SAME_CORNER = 2.0  # pixels within which keypoints are one corner, at several scales and orientations
 _TURNS: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)  # degrees, where nothing tells which way is up

@@ -47,9 +47,8 @@ _MIN_FRAMES = 4  # fewest frames of an initialization
 _MIN_FRAMES_WITHOUT_POINTS = 13
 _MAX_DEFORMATION = 0.15  # deformation that no initial map explains though it allows for half a turn
 _RETRY_INTERVAL = 5  # frames between attempts without points
-_MIN_TRACKED_SHARE = (
-    0.4  # share of the first frame's points that must be tracked to the last if they are reliable
-)
+# Share of the first frame's points that must be tracked to the last if they are reliable
+_MIN_TRACKED_SHARE = 0.4
 _MIN_SHARED = 0.1  # share of the first frame's points below which further frames add nothing
 _MIN_POINT_SHARE = 0.6  # share of `MOST_POINTS`, below which new corners are detected
 _SAME_PLACE = 1.5  # pixels

@@ -57,22 +57,15 @@ _NEIGHBOURS = 2  # places within which photos are neighbours (measured: the pot 
 _FIELDS_OF_VIEW = (45.0, 27.0, 65.0, 16.0)  # degrees, vertical, of the lenses that are tried
 _THRESHOLD, _LEAST_THRESHOLD = 0.006, 1.0  # largest residual as a share of the object's length, and in pixels
 _COMMON, _COMMON_IN_ALL = 10, 8  # points that two and all three of three photos share at least
-_TRIPLES, _MOST_TRIPLES, _STRUCTURES = (
-    6,
-    150,
-    3,
-)  # threes of photos that are tried and looked at; structures of each
+# Threes of photos that are tried and looked at; structures of each
+_TRIPLES, _MOST_TRIPLES, _STRUCTURES = 6, 150, 3
 _ENOUGH_POINTS, _ENOUGH_DEFORMATION = 60, 0.3  # of three photos, from which more makes no better start
 _SEED_PHOTOS, _GROWN = 6, 6  # photos up to which every start grows, and how many of the starts grow on
 _SHARED_POINTS = 5  # known points in a photo from which it can be added
-_LEAST_POINTS, _LEAST_SHARE = (
-    10,
-    0.5,
-)  # observations of an added photo that fit, and their share of those that could
-_LINK_POINTS, _LINK_SHARE = (
-    8,
-    0.65,
-)  # points that two photos share at least, and the share that fits if they agree
+# Observations of an added photo that fit, and their share of those that could
+_LEAST_POINTS, _LEAST_SHARE = 10, 0.5
+# Points that two photos share at least, and the share that fits if they agree
+_LINK_POINTS, _LINK_SHARE = 8, 0.65
 _CLEAR_SHARE = 0.8  # share of the observations from which no other pose of a photo is tried (chosen)
 _ENOUGH_JOINED = 0.9  # share of the photos from which no other start is tried (chosen)
 _ROUNDS = 3

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import takewhile
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +27,7 @@ from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, PoseCan
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
-from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.camera import Camera, pixel_distance
 from tracking3d.geometry.pose import Pose, pose_arrays, rotation_angle
 from tracking3d.points.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.points.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
@@ -76,8 +76,10 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
     keyframes = object_map.keyframes
     if inliers < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
         return True
-    angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
-    return bool(np.degrees(min(angles)) > config.keyframe_rotation)
+    poses = Pose.stack([other.pose for other in keyframes])
+    return (
+        math.degrees(rotation_angle(poses.quaternion, fit.pose.quaternion).min()) > config.keyframe_rotation
+    )
 
 
 def insert_points(
@@ -112,10 +114,8 @@ def insert_keyframe(
 ) -> tuple[ObjectMap, FollowedPoints]:
     """The map with a view as a new keyframe, refined over the local window, and the points to track from it."""
     object_map, view = insert_points(object_map, camera, view, image, detector)
-    drawn, filmed = (
-        object_map.keyframes[: object_map.fixed_keyframes],
-        (*object_map.keyframes[object_map.fixed_keyframes :], view),
-    )
+    drawn = object_map.keyframes[: object_map.fixed_keyframes]
+    filmed = (*object_map.keyframes[object_map.fixed_keyframes :], view)
     object_map = replace(object_map, keyframes=(*drawn, *cull_keyframes(filmed, config.max_keyframes)))
     window = window_of(len(object_map.keyframes), config.local_window)
     object_map = refine_local_map(object_map, camera, window, config, bundle_iterations=10, rounds=1)
@@ -256,10 +256,8 @@ def draw_keyframes(object_map: ObjectMap, camera: Camera, positions: list[int]) 
 MOST_CANDIDATES = 100
 _BAND_WIDTH = 0.25  # width of the band around the mask, relative to the root of its area
 _VIEWS = 3
-_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
-    1.0,
-    2.5,
-)  # mean residual in pixels at an object size of 200 pixels
+# Mean residual in pixels at an object size of 200 pixels
+_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = 1.0, 2.5
 _MIN_MOTION = 6.0  # such pixels
 _MIN_ROTATION = 12.0
 """Degrees by which an object that rested at first must have been seen to turn while a candidate was tracked: a thing on
@@ -267,46 +265,14 @@ a table turns less, if a hand touches it or the camera moves in a hand, and then
 _MAX_STATIC_MOTION = 0.3  # share of the motion that the object would have caused
 _SECTORS = 8  # directions into which the surroundings are divided
 _STATIC_SHARE = 0.6  # share of a sector's candidates, and of the sectors, that fit if the scene is static
-_MIN_SECTORS, _MIN_CANDIDATES = (
-    5,
-    3,
-)  # fewest sectors that can be tested, and fewest candidates of such a sector
+# Fewest sectors that can be tested, and fewest candidates of such a sector
+_MIN_SECTORS, _MIN_CANDIDATES = 5, 3
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(H, W)`` the band around a mask."""
     reach = max(round(_BAND_WIDTH * float(np.sqrt(mask.sum()))), 3)
-    return dilate_by_ellipse(mask, reach) & ~mask
-
-
-def dilate_by_ellipse(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """``(H, W)`` a mask dilated by OpenCV's ellipse of ``2 reach + 1`` pixels.
-
-    Row by row of the ellipse: that takes a time that grows with its height, and OpenCV's own grows with its area.
-    """
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if not width:
-        return np.zeros_like(mask)
-    rows = slice(max(y - reach, 0), min(y + height + reach, len(mask)))
-    columns = slice(max(x - reach, 0), min(x + width + reach, mask.shape[1]))
-    inside = mask[rows, columns]
-    place = np.arange(inside.shape[1], dtype=np.int32)
-    far = np.int32(4 * mask.shape[1])
-    before = place - np.maximum.accumulate(np.where(inside, place, -far), axis=1)
-    after = np.minimum.accumulate(np.where(inside, place, far)[:, ::-1], axis=1)[:, ::-1] - place
-    beside = np.minimum(np.minimum(before, after), reach + 1).astype(
-        np.int16
-    )  # pixels to the mask along the row
-    reached = np.zeros_like(inside)
-    half = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)).sum(1) // 2
-    count = len(inside)
-    for offset in range(-min(reach, count - 1), min(reach, count - 1) + 1):
-        to = slice(max(-offset, 0), min(count - offset, count))
-        there = slice(max(offset, 0), min(count + offset, count))
-        reached[to] |= beside[there] <= half[reach + offset]
-    dilated = np.zeros_like(mask)
-    dilated[rows, columns] = reached
-    return dilated
+    return (pixel_distance(mask) <= reach) & ~mask
 
 
 def with_candidates(

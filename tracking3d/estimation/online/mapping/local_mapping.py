@@ -23,7 +23,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.points.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.rendering import project as project_vertices
-from tracking3d.rendering import rasterize
+from tracking3d.rendering.visibility import nearest_depth
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is the same as a tracked point
@@ -50,12 +50,8 @@ def lift_pixels(
     screen, depth = project_vertices(
         object_map.vertices, view.pose.R[None], view.pose.translation[None], K[None]
     )
-    drawn = (
-        rasterize(screen, depth, object_map.shape.faces, (size, size), object_map.renderer)
-        .depth[0]
-        .cpu()
-        .numpy()
-    )
+    plane = nearest_depth(screen[0], depth[0], object_map.shape.faces, (size, size), object_map.renderer)
+    drawn = plane.cpu().numpy()
     in_window = (to_window(view, pixel) + 0.5) * finer - 0.5
     column, row = np.clip(np.rint(in_window), 0, size - 1).astype(int).T
     inside = (np.abs(in_window - (size - 1) / 2) <= size / 2).all(1)
@@ -141,11 +137,7 @@ def with_landmarks(
     fresh = np.flatnonzero(label < 0)
     # Two keypoints at one pixel are one landmark.
     pixels = np.concatenate([keypoints.pixel[fresh], corners])
-    points, met = (
-        lift_pixels(object_map, camera, view, pixels)
-        if len(pixels)
-        else (np.zeros((0, 3)), np.zeros(0, bool))
-    )
+    points, met = lift_pixels(object_map, camera, view, pixels)
     names = np.full(len(pixels), -1, np.int64)
     names[met] = len(object_map.landmarks) + np.arange(met.sum())
     landmarks = np.concatenate([object_map.landmarks, points[met]])
@@ -177,12 +169,7 @@ def nearest_views(keyframes: tuple[Keyframe, ...], pose: Pose, most: int) -> lis
 
 def viewing_angle(a: Pose, b: Pose) -> float:
     """Degrees between two poses' viewing directions of the object."""
-    directions = []
-    for pose in (a, b):
-        R, t = pose_arrays(pose)
-        direction = -R.T @ t
-        directions.append(direction / max(float(np.linalg.norm(direction)), 1e-9))
-    return float(np.degrees(np.arccos(np.clip(directions[0] @ directions[1], -1, 1))))
+    return float(np.degrees(np.arccos(np.clip(a.viewing_direction @ b.viewing_direction, -1, 1))))
 
 
 def window_of(count: int, most: int) -> list[int]:

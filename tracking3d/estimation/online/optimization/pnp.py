@@ -1,7 +1,7 @@
 """The pose of a known object from the pixels of its surface points (PnP), with and without an initial pose.
 
-Sampling is OpenCV's USAC over minimal sets of three points with local optimization; its result depends only on the
-seed, not on OpenCV's global generator. The sampled pose, and the initial pose if there is one, are refined under the
+Sampling is OpenCV's USAC over minimal sets of three points; its result depends only on the seed, not on OpenCV's global
+generator. The sampled pose, and the initial pose if there is one, are refined under the
 Cauchy loss.
 """
 
@@ -97,6 +97,8 @@ def _sample_pose(
     settings = cv2.UsacParams()
     settings.threshold, settings.confidence = threshold, _CONFIDENCE
     settings.maxIterations, settings.randomGeneratorState = _SAMPLES, seed
+    # `_refine_on_inliers` finds the same poses without it (measured, up to 80 % outliers), in a third of the time.
+    settings.loMethod = cv2.LOCAL_OPTIM_NULL
     try:
         found, _, turn, t, _ = cv2.solvePnPRansac(
             points, pixels, K.astype(np.float64), np.zeros(4), params=settings

@@ -27,27 +27,31 @@ def _alike_around(sided, radius, size, found):
     side = 2 * radius + 1
     least = 0.02 * side * side
     columns = np.zeros((sided.shape[1], 2 * size), np.int32)  # counts in each column within reach of a row
+    within = np.zeros(sided.shape[1], np.int64)  # of those, what lies in the mask
     around = np.empty(2 * size, np.int32)
     for row in range(sided.shape[0]):
         for column in range(sided.shape[1]):
             columns[column, sided[row, column]] += 1
+            within[column] += sided[row, column] >= size
             if row >= side:
                 columns[column, sided[row - side, column]] -= 1
+                within[column] -= sided[row - side, column] >= size
         at = row - side + 1
         if at < 0:
             continue
         around[:] = 0
+        inside = 0
         for column in range(side - 1):
+            inside += within[column]
             for one in range(2 * size):
                 around[one] += columns[column, one]
         for column in range(found.shape[2]):
+            inside += within[column + side - 1]
             for one in range(2 * size):
                 around[one] += columns[column + side - 1, one]
-            inside = 0
-            for one in range(size, 2 * size):
-                inside += around[one]
             label = sided[at + radius, column + radius] % size
             found[0, at, column] = around[size + label] / max(inside, least)
             found[1, at, column] = around[label] / max(side * side - inside, least)
+            inside -= within[column]
             for one in range(2 * size):
                 around[one] -= columns[column, one]
