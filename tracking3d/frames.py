@@ -92,12 +92,14 @@ class MaskEstimate:
         reason: Why there is no mask, or why the score is low; one short clause.
         occluder: ``(H, W)`` bool, what is in front of the object or beside it, such as a hand: neither object nor
             background. None where the tracker cannot tell; the network of `segment` is then asked.
+        carried: Whether the tracker was not asked, and this is the mask of the frame before, moved with the object.
     """
 
     mask: NDArray[np.float32] | None
     score: float = 1.0
     reason: str = ""
     occluder: NDArray[np.bool_] | None = None
+    carried: bool = False
 
     @property
     def binary(self) -> NDArray[np.bool_] | None:

@@ -237,6 +237,8 @@ LARGEST_OBJECT = 1e6
 """Metres that an object's longest side may have; chosen."""
 RETRACK_ANGLE = 0.75
 """Degrees; measured on box_in_hand and cube_in_hand."""
+MASK_INTERVAL = 2
+"""Frames; measured on box_in_hand and cube_in_hand."""
 MASK_AGREEMENT = 0.97
 """IoU; measured on box_in_hand and cube_in_hand."""
 AUTO = "auto"
@@ -390,6 +392,16 @@ class ObjectConfig(Section):
         description=(
             "In the final refinement a mask that agrees by more than this IoU with the silhouette and the initial mask "
             "is right: it need not be segmented again, nor its frame be estimated again. 1 does both in all frames."
+        ),
+    )
+    mask_interval: int = Field(
+        MASK_INTERVAL,
+        ge=1,
+        le=8,
+        description=(
+            "A mask tracker that can leave frames out is asked about every so many-th frame while solver online is "
+            "sure of the object and tracks points on it; in between its mask is moved as these points are. 1 asks it "
+            "about every frame."
         ),
     )
     texture_views: int = Field(

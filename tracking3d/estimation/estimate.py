@@ -193,6 +193,9 @@ WORTH_CORRECTING = (0.5, 0.9)
 width of an outline; below, one of them is of something else, and it is not known which."""
 
 
+_ENOUGH_POINTS = 30
+"""Inliers of a frame whose motion carries its mask to the next one (chosen)."""
+
 RELOCALIZED = "relocalized"
 """What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame; where the
 mask tracker was elsewhere or had nothing, it is set on what was found, however sure that is."""
@@ -227,6 +230,21 @@ def corrects(estimate: FrameEstimate) -> bool:
     if not both or both < least * either:
         return False
     return moving or (estimate.confidence >= SURE and both <= most * either)
+
+
+CARRIED = "carried"
+"""In `FrameEstimate.diagnostics`, 1 if the mask tracker was not asked: the initial mask is that of the frame before,
+moved with the object."""
+
+
+def stands_alone(estimate: FrameEstimate) -> bool:
+    """Whether an estimate is so sure that the mask tracker need not be asked in the frame after it.
+
+    A keyframe makes the map, and what it shows of a new side is in no earlier mask.
+    """
+    sure = estimate.status is Status.TRACKED and estimate.confidence >= SURE
+    points = estimate.diagnostics.get("inliers", 0.0) >= _ENOUGH_POINTS
+    return sure and points and not estimate.keyframe and not corrects(estimate)
 
 
 def with_initial_mask(estimate: FrameEstimate) -> FrameEstimate:

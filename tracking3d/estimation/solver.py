@@ -101,6 +101,10 @@ class RefiningSolver(Protocol, Generic[State]):
         """The state before ``step`` takes a frame whose mask ``(H, W)`` the user has given."""
         ...
 
+    def carry_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """The mask ``(H, W)`` of the last frame, moved into ``frame`` as the object moves; None if that is unknown."""
+        return None
+
     def continue_refinement(self, state: State, start: RefinedStart) -> State | None:
         """The state for ``refine_frame`` and ``result`` from an earlier refinement, of which most frames keep their
         estimates, in place of ``refine``; None if it does not fit ``start``."""

@@ -126,6 +126,19 @@ class PromptedTracker:
         return estimate
 
     @property
+    def can_skip(self) -> bool:
+        """Whether it need not be asked in every frame, see `tracking3d.trackers.protocol.SparingTracker`."""
+        return self._tracker.can_skip and not self.waits
+
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Tell the tracker where the object is in the next frame, ``mask`` ``(H, W)``, in place of ``step``.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        self._tracker.skip(frame, mask)
+
+    @property
     def can_correct(self) -> bool:
         """Whether the tracker can be re-anchored, see `tracking3d.trackers.protocol.CorrectableTracker`."""
         return self._tracker.can_correct or self.waits

@@ -24,8 +24,10 @@ from tracking3d.pipeline.refinement_steps import (
 from tracking3d.pipeline.session import Session
 from tracking3d.reconstruction import bake_texture, close_unseen
 from tracking3d.reconstruction.final_shape import is_reconstructed
+from tracking3d.results import layout
 from tracking3d.results.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
 from tracking3d.results.checkpoint.run_state import RunState
+from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -135,6 +137,7 @@ class ObjectRecorder:
                 initial.reason,
                 self._session.corrected,
                 self._session.failure_at(frame.index),
+                initial.carried,
             )
             kept = self._session.state_dict()
         return self._work.do(partial(self._write, estimate, frame, taken, kept))
@@ -172,7 +175,9 @@ class ObjectRecorder:
         check_picture(kept, frame)
         assert isinstance(frame, Frame)
         if self._session.replays:
-            self._session.coming = coming if isinstance(coming, Frame) else None
+            self._session.coming = None
+            if isinstance(coming, Frame) and (after := kept.taken.get(coming.index)) and not after.carried:
+                self._session.coming = coming
             self._replay(kept, frame)
         if self._corrected is not None and self._refines:
             return self._writer.kept_record(
@@ -183,11 +188,13 @@ class ObjectRecorder:
     def _replay(self, kept: SavedState, frame: Frame) -> None:
         """Show a frame to the mask tracker again; warn once if the tracker gives another mask than before."""
         taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
-        correction = None
+        correction = carried = None
+        if taken.carried:
+            carried = read_mask(layout.initial_mask_path(self._writer.folder, frame.index))
         if taken.corrected and self._state.checkpoint:
             correction = self._state.checkpoint.correction(frame.index)
-        prompts = prompts_in(frame, self._tracked.corrections)
-        mask = self._session.replay(frame, first, correction, *prompts)
+        prompt = next(iter(prompts_in(frame, self._tracked.corrections)), None)
+        mask = self._session.replay(frame, first, correction, prompt, carried)
         if self._warned or taken.failure or not mask or is_initial_mask(self._writer.folder, frame, mask):
             return
         self._warned = True

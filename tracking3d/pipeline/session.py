@@ -13,12 +13,14 @@ from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import AUTO, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import (
+    CARRIED,
     FrameEstimate,
     ObjectModel,
     Status,
     corrects,
     lost_estimate,
     mark_failed,
+    stands_alone,
     with_initial_mask,
 )
 from tracking3d.estimation.solver import RefiningSolver, Solver
@@ -108,6 +110,7 @@ class Session(SessionRefinement):
         self.corrected = False
         self.coming: Frame | None = None
         self._last_pose = self._first_pose = np.eye(4)
+        self._spare = -1
         self._failures: dict[int, str] = {}
         self._late: list[FrameEstimate] = []
         self._refined = False
@@ -146,20 +149,48 @@ class Session(SessionRefinement):
                 if self._solver is None:
                     estimate = self._start(frame)
                 else:
-                    solver, mask = self._solver_for(frame), self._follow_mask(frame, prompt)
-                    try:
-                        shown = self._undistortion.frame(self._presented.number(frame))
-                        if prompt is not None:
-                            self._trust(shown, mask)
-                        self._state, estimate = solver.step(self._state, shown, self._undistortion.mask(mask))
-                        estimate = self._of_picture(estimate, mask)
-                    except PluginFailure as error:
-                        self._tolerate(frame, error)
-                        estimate = lost_estimate(frame, mask, self._last_pose)
+                    solver = self._solver_for(frame)
+                    unaided = self._spare > 0 and prompt is None
+                    found = self._step_unaided(solver, frame) if unaided else None
+                    estimate = found or self._step(solver, frame, prompt)
                     estimate = self._remember(frame, estimate, corrected=prompt is not None)
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         return add_times(estimate, watch, frame)
+
+    def _step(self, solver: Solver[Any], frame: Frame, prompt: Prompt | None) -> FrameEstimate:
+        mask = self._follow_mask(frame, prompt)
+        try:
+            shown = self._undistortion.frame(self._presented.number(frame))
+            if prompt is not None:
+                self._trust(shown, mask)
+            self._state, estimate = solver.step(self._state, shown, self._undistortion.mask(mask))
+            return self._of_picture(estimate, mask)
+        except PluginFailure as error:
+            self._tolerate(frame, error)
+            return lost_estimate(frame, mask, self._last_pose)
+
+    def _step_unaided(self, solver: Solver[Any], frame: Frame) -> FrameEstimate | None:
+        """Take a frame with the last one's mask, carried into it; None if the mask tracker is needed after all."""
+        before = self._undistortion.mask(self.initial_mask)
+        if before.found is None or not isinstance(solver, RefiningSolver):
+            return None
+        shown = self._undistortion.frame(self._presented.number(frame))
+        try:
+            if (moved := solver.carry_mask(self._state, shown, before.found)) is None or not moved.any():
+                return None
+            seen = replace(before, mask=moved.astype(np.float32))
+            state, estimate = solver.step(self._state, shown, seen)
+            initial = self._undistortion.estimate(estimate).initial_mask
+            if initial is None or not stands_alone(estimate):
+                return None
+            self._tracker.skip(frame, initial)
+        except PluginFailure:  # `_step` reports it
+            return None
+        self._state, self.corrected = state, False
+        self.initial_mask = replace(self.initial_mask, mask=initial.astype(np.float32), carried=True)
+        estimate = replace(estimate, diagnostics={**estimate.diagnostics, CARRIED: 1.0})
+        return self._of_picture(estimate, self.initial_mask)
 
     def _start(self, frame: Frame) -> FrameEstimate:
         solver = self._prepare(frame)
@@ -202,6 +233,7 @@ class Session(SessionRefinement):
             "initial_mask": self.initial_mask,
             "last_pose": self._last_pose,
             "steering": (self._first_pose, self._presented, self._latest, self._tracker.restarted),
+            "spare": self._spare,
             "refined": self._refined,
             "refining": self.refining,
             "random": self._settings.random,
@@ -248,6 +280,7 @@ class Session(SessionRefinement):
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)
         self._first_pose, self._presented, self._latest, self._tracker.restarted = kept["steering"]
+        self._spare = kept.get("spare", -1)
         self.refining, self._settings.random = kept["refining"], kept["random"]
         if self._tracker.can_resume and not self._refined:
             with self._settings.in_force():
@@ -259,7 +292,12 @@ class Session(SessionRefinement):
         return not self._tracker.can_resume and not self._refined
 
     def replay(
-        self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None, prompt: Prompt | None = None
+        self,
+        frame: Frame,
+        first: bool,
+        correction: NDArray[np.bool_] | None,
+        prompt: Prompt | None = None,
+        carried: NDArray[np.bool_] | None = None,
     ) -> MaskEstimate | None:
         """Take the mask tracker alone through a frame that is estimated already.
 
@@ -268,13 +306,17 @@ class Session(SessionRefinement):
             first: Whether it is the first one.
             correction: ``(H, W)`` the feedback to the tracker after it, if any.
             prompt: What ``step`` was given with it.
+            carried: ``(H, W)`` its initial mask, if the tracker was not asked.
 
         Returns:
-            The tracker's estimate; None if it fails.
+            The tracker's estimate; None if it fails or was not asked.
         """
         estimate = None
         try:
             with self._replaying.in_force():
+                if carried is not None:
+                    self._tracker.skip(frame, carried)
+                    return None
                 estimate = self._tracker.start(frame) if first else self._tracker.step(frame, prompt)
                 if not first:
                     self._tracker.announce(self.coming)
@@ -290,12 +332,23 @@ class Session(SessionRefinement):
         self.corrected = False
         try:
             mask = self._tracker.step(frame, prompt)
-            self._tracker.announce(self.coming)
+            if self._spare < 0:  # else it is not known yet whether the tracker is asked next
+                self._tracker.announce(self.coming)
         except PluginFailure as error:
             self._tolerate(frame, error)
-            mask = replace(self.initial_mask, score=0.0, reason=error.reason)
+            mask = replace(self.initial_mask, score=0.0, reason=error.reason, carried=False)
         self.initial_mask = mask
         return mask
+
+    def _count_spare(self, estimate: FrameEstimate) -> int:
+        """For how many frames after this one the mask tracker need not be asked; -1 if it need be twice at least."""
+        wanted = self.config.object
+        may_skip = wanted.mask_interval > 1 and self._tracker.can_skip and not wanted.trust_masks
+        if not may_skip or estimate.index in self._failures or not stands_alone(estimate):
+            return -1
+        if self.initial_mask.carried:
+            return self._spare - 1
+        return wanted.mask_interval - 1 if self._spare >= 0 else 0
 
     def _trust(self, shown: Frame, mask: MaskEstimate) -> None:
         """Have the solver trust the mask of a corrected frame, which is ``shown`` to it next."""
@@ -314,9 +367,12 @@ class Session(SessionRefinement):
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
         for one in (*estimate.revised, estimate):
             self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose
+        spare, self._spare = self._spare, self._count_spare(estimate)
         try:
             if not corrected:
                 self._feed_back(frame, estimate)
+            if spare >= 0 and self._spare < 1:
+                self._tracker.announce(self.coming)
         except PluginFailure as error:
             self._tolerate(frame, error)
         revised = tuple(map(self._with_failure, estimate.revised))
@@ -337,7 +393,7 @@ class Session(SessionRefinement):
             else:
                 check_backward_tracking(self.config)
                 assert isinstance(solver, RefiningSolver)
-                self._presented = FrameOrder(first.index, self._latest)
+                self._presented, self._spare = FrameOrder(first.index, self._latest), -1
                 first = self._undistortion.frame(first)
                 self._state = solver.restart_backwards(self._state, first, self._latest, self._first_pose)
         return solver

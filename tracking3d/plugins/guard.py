@@ -20,7 +20,13 @@ from tracking3d.features.protocol import FeatureEncoder, KeypointDetector, Keypo
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import describe_exception
 from tracking3d.runtime.stage_times import in_stage
-from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, ResumableTracker
+from tracking3d.trackers.protocol import (
+    CorrectableTracker,
+    ForewarnedTracker,
+    MaskTracker,
+    ResumableTracker,
+    SparingTracker,
+)
 
 
 class PluginFailure(PluginError):
@@ -104,6 +110,21 @@ class GuardedTracker:
         if isinstance(self._tracker, ForewarnedTracker):
             with in_stage("track"), _blame_plugin(self._label):
                 self._tracker.announce(frame)
+
+    @property
+    def can_skip(self) -> bool:
+        """Whether it need not be asked in every frame; see `tracking3d.trackers.protocol.SparingTracker`."""
+        return isinstance(self._tracker, SparingTracker)
+
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Tell the tracker where the object is in the next frame; does nothing if it has to be asked.
+
+        Raises:
+            PluginFailure: The tracker fails.
+        """
+        if isinstance(self._tracker, SparingTracker):
+            with in_stage("track"), _blame_plugin(self._label):
+                self._tracker.skip(frame, mask.copy())
 
     @property
     def can_resume(self) -> bool:

@@ -105,6 +105,11 @@ class CsrtTracker:
         if self._boxes is not None:
             self._boxes.announce(frame.image)
 
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Go on from ``mask`` ``(H, W)`` in the next frame; the box tracker does not look at it."""
+        if self._segmentation is not None:
+            self._segmentation.skip(frame.image, mask)
+
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Re-anchor the segmentation on ``mask`` ``(H, W)`` in ``frame``, and the box tracker if it has strayed."""
         box = box_of(mask)

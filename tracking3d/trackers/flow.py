@@ -125,6 +125,11 @@ class FlowTracker:
         self._tracked_box = self._box_tracker.update(frame.image) if self._box_tracker else None
         return self._segmentation.step(frame.image, self._tracked_box)
 
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Go on from ``mask`` ``(H, W)`` in the next frame; the box tracker does not look at it."""
+        if self._segmentation is not None:
+            self._segmentation.skip(frame.image, mask)
+
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Continue from ``mask`` ``(H, W)`` in ``frame``; re-initialize the box tracker too if it has drifted."""
         box = box_of(mask)

@@ -62,6 +62,15 @@ class ForewarnedTracker(Protocol):
 
 
 @runtime_checkable
+class SparingTracker(Protocol):
+    """A mask tracker that need not be asked in every frame."""
+
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Take ``mask`` ``(H, W)`` as the object's place in the next frame, in place of ``step``."""
+        ...
+
+
+@runtime_checkable
 class ResumableTracker(Protocol):
     """A mask tracker that can be asked for its memory, and be given it again in another process.
 

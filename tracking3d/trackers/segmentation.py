@@ -149,6 +149,12 @@ class ColourSegmentation:
             self._colours.update(view.lab, *both_sides(crop_window(self._mask, view.window)))
             self._background.forget(mask)
 
+    def skip(self, image: Image, mask: NDArray[np.bool_]) -> None:
+        """Go on from ``mask`` ``(H, W)`` in ``image``, the next frame, and learn nothing."""
+        self._velocity = _shift(box_of(self._mask), box_of(mask))
+        self._image, self._mask = image, mask.astype(np.float32)
+        self._background.lose()
+
     def step(self, image: Image, tracked_box: Box | None = None) -> MaskEstimate:
         """Segment the next frame.
 

@@ -19,7 +19,7 @@ from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online import atlas, refiner
-from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.features.klt import FollowedPoints, carry, follow, grey
 from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initializer import Initializer
 from tracking3d.estimation.online.mapper import adopt_free_axis, insert_frame
@@ -339,6 +339,11 @@ class OnlineSolver:
     def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
         return self.initializer.finish_background_work(state)
+
+    @staticmethod
+    def carry_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """The last frame's mask ``(H, W)`` in the next one, moved as the tracked points are."""
+        return carry(mask, state.grey, grey(frame.image), state.tracked_points)
 
     @staticmethod
     def restart_backwards(

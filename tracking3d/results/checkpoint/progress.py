@@ -43,6 +43,7 @@ class JournalEntry:
     reason: str = ""
     corrected: bool = False  # whether the estimate was fed back to the mask tracker
     failure: str = ""  # which plug-in failed at it, and why; empty if none did
+    carried: bool = False  # whether the mask tracker was not asked
 
 
 @dataclass(frozen=True)

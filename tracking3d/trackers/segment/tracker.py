@@ -194,6 +194,12 @@ class SegmentTracker:
         if self._state is not None:
             self._lookahead.begin(frame.image, partial(_step_copy, self._state, frame.image))
 
+    def skip(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Go on from ``mask`` ``(H, W)`` in the next frame."""
+        if self._state is not None:
+            self._lookahead.discard()
+            self._state.segmentation.skip(frame.image, mask)
+
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Continue from ``mask`` ``(H, W)`` in ``frame``."""
         if (box := box_of(mask)) is not None and self._state is not None:

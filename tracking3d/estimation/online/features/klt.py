@@ -23,6 +23,8 @@ _FLOW_WINDOW = (15, 15)
 _FLOW_LEVELS = 3
 _MAX_FORWARD_BACKWARD_ERROR = 0.7  # largest forward-backward error in pixels
 
+_LEAST_CARRYING, _MOST_APART = 12, 2.0  # points, and pixels, that agree on how a mask moves (chosen)
+
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
@@ -96,6 +98,28 @@ def follow(
     inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
     kept = found & found_back & returned & inside
     return FollowedPoints(points.landmark[kept], there[kept])
+
+
+def carry(
+    mask: NDArray[np.bool_], before: NDArray[np.uint8], now: NDArray[np.uint8], points: FollowedPoints
+) -> NDArray[np.bool_] | None:
+    """A mask ``(H, W)`` moved by the affine map that most of the points follow; None if too few do.
+
+    Args:
+        mask: In the earlier frame.
+        before: ``(H, W)`` grey image of that.
+        now: The later one.
+        points: In the earlier frame.
+    """
+    here = follow(before, now, points)
+    there = points.pixel[np.isin(points.landmark, here.landmark)]
+    if len(here) < _LEAST_CARRYING:
+        return None
+    affine, agreeing = cv2.estimateAffine2D(there, here.pixel, ransacReprojThreshold=_MOST_APART)
+    if affine is None or np.count_nonzero(agreeing) < _LEAST_CARRYING:
+        return None
+    moved = cv2.warpAffine(mask.astype(np.float32), affine, mask.shape[::-1], flags=cv2.INTER_LINEAR)
+    return np.asarray(moved > 0.5)
 
 
 def new_corners(
