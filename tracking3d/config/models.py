@@ -399,9 +399,9 @@ class ObjectConfig(Section):
         ge=1,
         le=8,
         description=(
-            "A mask tracker that can leave frames out is asked about every so many-th frame while solver online is "
-            "sure of the object and tracks points on it; in between its mask is moved as these points are. 1 asks it "
-            "about every frame."
+            "Frames from one that a mask tracker is asked about to the next, if it can leave frames out, while solver "
+            "online is sure of the object and tracks points on it; in between its mask is moved as these points are. "
+            "1 asks it about every frame."
         ),
     )
     texture_views: int = Field(

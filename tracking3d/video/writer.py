@@ -22,7 +22,7 @@ from tracking3d.video.video_decoding import codec_threads
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 """Encoders by preference: x264, other H.264 encoders, and MPEG-4 part 2, which every FFmpeg has."""
 
-_OPTIONS = {"libx264": {"crf": "20", "preset": "ultrafast", "tune": "zerolatency"}, "mpeg4": {"qscale": "3"}}
+_OPTIONS = {"libx264": {"crf": "20", "preset": "superfast", "tune": "zerolatency"}, "mpeg4": {"qscale": "3"}}
 
 _FRAGMENTED = {"movflags": "+frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
 """Every frame is its own fragment, so that the file plays while it grows, and a killed process loses only the last one.
