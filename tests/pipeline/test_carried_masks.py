@@ -12,6 +12,8 @@ from resumable_runs import Stopped, assert_alike, settings, stop_at
 
 from tracking3d.estimation.estimate import CARRIED, Status
 from tracking3d.estimation.online.features.klt import FollowedPoints, carry
+from tracking3d.pipeline import session
+from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.results.checkpoint.progress import read_journal
@@ -101,6 +103,32 @@ def test_a_resumed_run_carries_the_same_masks(clip, images, tmp_path, monkeypatc
     assert_alike(resumed.folder, whole.folder)
     for index in range(FRAMES):
         np.testing.assert_array_equal(resumed.initial_mask(index), whole.initial_mask(index))
+
+
+def test_a_resumed_mask_tracker_is_corrected_by_what_was_seen_of_the_object(
+    clip, images, tmp_path, monkeypatch
+):
+    given, correct = [], FlowTracker.correct
+
+    def noted(self, frame, mask):
+        given.append((frame.index, mask))
+        return correct(self, frame, mask)
+
+    def beside_a_hand(self, frame, estimate):
+        hand = np.zeros(frame.size, bool)
+        hand[:, : frame.size[1] // 2] = True
+        return replace(estimate, occluder=hand)
+
+    monkeypatch.setattr(FlowTracker, "correct", noted)
+    monkeypatch.setattr(PromptedTracker, "_with_occluder", beside_a_hand)
+    monkeypatch.setattr(session, "corrects", lambda estimate: estimate.index == 2)
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        stop_at(patch, Session, "step", 6)
+        run(clip, images, tmp_path / "run")
+    run(clip, images, tmp_path / "run", resume=True)
+    (index, before), (again, after) = given
+    assert index == again == 2
+    np.testing.assert_array_equal(before, after)
 
 
 def test_journals_from_before_there_were_carried_masks_are_read():

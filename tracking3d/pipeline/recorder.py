@@ -158,7 +158,7 @@ class ObjectRecorder:
         record, checkpoint = self._writer.write(estimate, frame), self._state.checkpoint
         if checkpoint and taken is not None and session is not None:
             if taken.corrected:
-                checkpoint.keep_correction(frame.index, estimate.mask)
+                checkpoint.keep_correction(frame.index, estimate.visible_mask)
             revised = [one.index for one in estimate.revised]
             so_far = {"lines": self._writer.lines, "seconds": self._writer.seconds}
             self._state.advance(session, taken, revised, last=frame.index, **so_far)
