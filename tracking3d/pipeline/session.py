@@ -179,7 +179,7 @@ class Session(SessionRefinement):
         try:
             if (moved := solver.carry_mask(self._state, shown, before.found)) is None or not moved.any():
                 return None
-            seen = replace(before, mask=moved.astype(np.float32))
+            seen = replace(before, mask=moved.astype(np.float32), carried=True)
             state, estimate = solver.step(self._state, shown, seen)
             initial = self._undistortion.estimate(estimate).initial_mask
             if initial is None or not stands_alone(estimate):

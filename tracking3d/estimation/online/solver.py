@@ -122,7 +122,7 @@ class OnlineSolver:
         state, revised = self.initializer.restart_if_misfit(state)
         if not self.initializer.in_background:  # it takes seconds, for which a live source would wait
             state = adopt_free_axis(state, self.options)
-        state, estimate = self._track(state, frame, image, binary, self.options)
+        state, estimate = self._track(state, frame, image, binary, self.options, not mask.carried)
         if binary is not None and atlas.needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, image, binary)
         estimate = replace(estimate, revised=(*revised, *estimate.revised))
@@ -135,13 +135,14 @@ class OnlineSolver:
         image: NDArray[np.uint8],
         mask: NDArray[np.bool_] | None,
         options: OnlineConfig,
+        may_insert: bool = True,
     ) -> tuple[Mapped, FrameEstimate]:
-        """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
+        """Estimate the frame's pose, and insert the frame into the map if it may and shows something new."""
         view, starts = self.tracker.predict(state, frame, image, mask)
         found = self.tracker.find(state, view, frame, image, starts)
         usual = not (found.lost or is_high_loss(found.fit, state.baseline, found.view.mask_weight))
         reliable = usual or (not found.lost and found.evidence.is_decisive)
-        is_keyframe = reliable and needs_keyframe(state.object_map, found, options)
+        is_keyframe = may_insert and reliable and needs_keyframe(state.object_map, found, options)
         pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
         updated = advance(state, found, pose, image)
         if usual:
