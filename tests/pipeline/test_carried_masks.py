@@ -29,11 +29,14 @@ class SureSolver(StandInSolver):
 
     in_doubt: tuple[int, ...] = ()
     taken: list[int]
+    moved: list[int]
 
     def _answer(self, frame, mask):
         status = Status.UNCERTAIN if frame.index in self.in_doubt else Status.TRACKED
         estimate = replace(super()._answer(frame, mask), keyframe=False, mask=mask.binary)
         self.taken.append(frame.index)
+        if mask.carried:
+            self.moved.append(frame.index)
         return replace(estimate, status=status, confidence=0.95, diagnostics={"inliers": 50.0})
 
     def carry_mask(self, state, frame, mask):
@@ -45,6 +48,7 @@ def sure_solver(monkeypatch, stand_in_solver):
     monkeypatch.setitem(SOLVERS, "online", SureSolver)
     monkeypatch.setattr(SureSolver, "in_doubt", ())
     monkeypatch.setattr(SureSolver, "taken", [], raising=False)
+    monkeypatch.setattr(SureSolver, "moved", [], raising=False)
 
 
 def run(clip, images, folder, *overrides: str, resume: bool = False) -> RunReader:
@@ -68,7 +72,7 @@ def test_every_second_frame_is_carried_once_two_in_a_row_were_sure(clip, images,
 
         monkeypatch.setattr(FlowTracker, name, noted)
     made = run(clip, images, tmp_path / "run")
-    assert carried(made) == told == [3, 5, 7, 9, 11, 13]
+    assert carried(made) == told == SureSolver.moved == [3, 5, 7, 9, 11, 13]
     assert shown == [1, 2, 4, 6, 8, 10, 12]
     for index in told:
         moved = np.roll(made.initial_mask(index - 1), 1, axis=1)

@@ -9,7 +9,7 @@ import pytest
 from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_mask, whole_run
 
 from tracking3d.estimation.estimate import RELOCALIZED, Assessment, MaskSource, Status, corrects
-from tracking3d.estimation.online import tracker
+from tracking3d.estimation.online import relocalization, tracker
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.relocalization import overlaps_mask, relocalize_in_frame
 from tracking3d.frames import Frame
@@ -98,3 +98,24 @@ def test_a_mask_is_elsewhere_if_hardly_any_of_it_is_at_the_silhouette():
     assert overlaps_mask(silhouette, silhouette) and overlaps_mask(silhouette, half)
     assert not overlaps_mask(silhouette, far)
     assert not overlaps_mask(silhouette, np.zeros((40, 60), bool))
+
+
+def test_no_keypoints_are_looked_for_if_the_map_has_none(monkeypatch):
+    monkeypatch.setattr(relocalization, "detect_turned", lambda *_, **__: pytest.fail("for nothing"))
+    state, _ = whole_run()
+    plain, image, view = (
+        replace(state.object_map, pointless=True),
+        grey(frame(0).image),
+        state.object_map.keyframes[0],
+    )
+    assert relocalize_in_frame(plain, state.camera, image, view.pose) is None
+    assert relocalization.match_keyframes(plain, state.camera, view, image, anywhere=True) == []
+
+
+def test_a_frame_with_a_mask_that_was_moved_becomes_no_keyframe(monkeypatch):
+    monkeypatch.setattr("tracking3d.estimation.online.solver.needs_keyframe", lambda *_: True)
+    state, _ = whole_run()
+    own = replace(estimate_of(true_mask(FRAMES - 1)), carried=True)
+    again = Frame(FRAMES, frame(FRAMES - 1).image)
+    assert not solver().step(state, again, own)[1].keyframe
+    assert solver().step(state, again, replace(own, carried=False))[1].keyframe
