@@ -267,19 +267,19 @@ class CameraConfig(Section):
     """The camera of the full frame."""
 
     fov: float | None = Field(
-        None, gt=1, lt=170, description="Vertical field of view in degrees; 45 if nothing better is known."
+        None, gt=1, lt=170, description="Vertical field of view in degrees. 45 if nothing better is known."
     )
     intrinsics: tuple[float, float, float, float] | None = Field(
         None,
-        description="Focal lengths and principal point fx, fy, cx, cy in pixels of the full frame; overrides fov.",
+        description="Focal lengths and principal point, in pixels of the full frame. As fx, fy, cx, cy; overrides fov.",
     )
 
     distortion: tuple[float, ...] | None = Field(
         None,
         max_length=14,
         description=(
-            "Lens distortion coefficients k1, k2, p1, p2, k3 and so on in OpenCV's order. Images are undistorted when "
-            "they are read, and masks distorted when they are written."
+            "Lens distortion coefficients in OpenCV's order. They are k1, k2, p1, p2, k3 and so on; images are "
+            "undistorted when they are read, and masks distorted when they are written."
         ),
     )
     distortion_model: Literal["radtan", "fisheye"] = Field(
@@ -289,8 +289,7 @@ class CameraConfig(Section):
     file: str | None = Field(
         None,
         description=(
-            "Camera file, instead of intrinsics and distortion: YAML of OpenCV or ROS, Kalibr's camchain, or COLMAP's "
-            "cameras.txt."
+            "Camera file with intrinsics and distortion: YAML of OpenCV, ROS or Kalibr, or COLMAP's cameras.txt."
         ),
     )
 
@@ -340,7 +339,8 @@ class ObjectConfig(Section):
         ),
     )
     prototype: str = Field(
-        "ellipsoid", description="Initial shape: sphere, ellipsoid (fitted to the first mask) or a mesh file."
+        "ellipsoid",
+        description="Initial shape: sphere, ellipsoid or a mesh file. The ellipsoid is fitted to the first mask.",
     )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
     texture_size: int = Field(150, ge=16, le=2048, description="Side of the feature texture in texels.")
@@ -374,8 +374,8 @@ class ObjectConfig(Section):
     trust_masks: bool = Field(
         False,
         description=(
-            "The initial masks are right: every frame that has one keeps it, and poses and surface are fitted to "
-            "it throughout."
+            "The masks of all frames (--masks) are right, for example drawn by hand: keep them. Poses and surface are "
+            "fitted to them throughout."
         ),
     )
     refine_masks: bool = Field(
@@ -429,13 +429,14 @@ class ObjectConfig(Section):
         gt=0,
         le=LARGEST_OBJECT,
         description=(
-            "Metres of the object's longest side: of the longest side of the smallest box around what the video has "
-            "shown. All lengths of the finished run are then in metres; null leaves the run's arbitrary unit. A known "
-            "object has its own unit."
+            "Metres of the object's longest side; all lengths of the run are then in metres. It is that of "
+            "the smallest box around what the video has shown; null leaves the run's arbitrary unit. A known object "
+            "has its own unit."
         ),
     )
     flat: bool = Field(
-        False, description="Planar object: project all vertices onto one plane after each iteration."
+        False,
+        description="The object is planar, like a card. All vertices are projected onto one plane at each iteration.",
     )
 
     @property
@@ -465,7 +466,10 @@ class CropConfig(Section):
     """The crop of the frame that is rendered and compared."""
 
     size: int = Field(
-        128, ge=32, le=1024, description="Working resolution: side of the square crop in pixels."
+        128,
+        ge=32,
+        le=1024,
+        description="Working resolution: side of the square crop around the object, in pixels.",
     )
     margin: float = Field(
         0.3,
@@ -478,8 +482,8 @@ class CropConfig(Section):
 class RuntimeConfig(Section):
     """Device, threads, and what a run keeps and tolerates."""
 
-    device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
-    seed: int = Field(0, ge=0, lt=2**64, description="Random seed.")
+    device: str = Field("cpu", description="Device: cpu, cuda or cuda:N.")
+    seed: int = Field(0, ge=0, lt=2**64, description="Random seed of the run.")
     threads: int = Field(
         1,
         ge=1,
@@ -507,18 +511,59 @@ class RuntimeConfig(Section):
     on_plugin_failure: Literal["continue", "stop"] = Field(
         "continue",
         description=(
-            "If a plug-in fails after the first frame: record the reason and continue with the last mask, or stop and "
-            "keep the finished frames."
+            "If a plug-in fails after the first frame: continue with the last mask, or stop. The reason is recorded, "
+            "and finished frames are kept."
         ),
+    )
+
+
+def _one_or_several(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Texts = Annotated[tuple[str, ...], BeforeValidator(_one_or_several)]
+"""One text or a list of them."""
+
+
+class PromptSection(Section):
+    """The objects to track; every value is written as on the command line. Only ``run`` reads it, for one video."""
+
+    box: Texts = Field(
+        (),
+        description="Box around the object in the first frame, in pixels, or a file in VOT's region format; several "
+        "boxes are several objects.",
+    )
+    box_format: Literal["xywh", "xyxy"] | None = Field(
+        None, description="How boxes are written: X,Y,WIDTH,HEIGHT, the default, or X1,Y1,X2,Y2."
+    )
+    mask: Texts = Field(
+        (),
+        description="Mask image of the object in the first frame; @N picks object N of an indexed image, and several "
+        "masks are several objects.",
+    )
+    points: Texts = Field(
+        (),
+        description="Points in the first frame, + on the object and - on the background; several are several objects.",
+    )
+    start_frame: int | None = Field(
+        None,
+        ge=0,
+        description="Frame of the prompt, if not the first; tracking runs forwards and backwards from it.",
+    )
+    correct: Texts = Field(
+        (), description="Prompt in a later frame, or several; the mask tracker restarts from it."
     )
 
 
 class PipelineConfig(Section):
     """The whole pipeline."""
 
-    tracker: PluginChoice = PluginChoice(name=AUTO)
-    features: PluginChoice = PluginChoice(name="rgb")
-    keypoints: PluginChoice = PluginChoice(name="sift")
+    tracker: PluginChoice = Field(
+        PluginChoice(name=AUTO),
+        description="Mask tracker; `tracking3d plugins` lists them, and auto takes the best one at hand.",
+    )
+    features: PluginChoice = Field(PluginChoice(name="rgb"), description="Feature encoder.")
+    keypoints: PluginChoice = Field(PluginChoice(name="sift"), description="Keypoint detector.")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
     crop: CropConfig = CropConfig()

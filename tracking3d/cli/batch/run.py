@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -98,26 +98,22 @@ JsonEvents = Annotated[
 class EngineOptions:
     """Where the videos are tracked, and with what resources."""
 
+    PANEL: ClassVar = PERFORMANCE
+
     workers: Annotated[
         int | None,
         typer.Option(
-            metavar="N",
-            min=1,
-            max=100_000,
-            help="Videos tracked at the same time; default one per core.",
-            rich_help_panel=PERFORMANCE,
+            metavar="N", min=1, max=100_000, help="Videos tracked at the same time; default one per core."
         ),
     ] = None
     address: Address = None
     threads: Annotated[
         int,
-        typer.Option(metavar="N", min=1, max=256, help="Cores for each video.", rich_help_panel=PERFORMANCE),
+        typer.Option(metavar="N", min=1, max=256, help="Cores for each video."),
     ] = 1
     memory: Annotated[
         int | None,
-        typer.Option(
-            metavar="MB", min=1, help="Memory reserved for each video.", rich_help_panel=PERFORMANCE
-        ),
+        typer.Option(metavar="MB", min=1, help="Memory reserved for each video."),
     ] = None
 
 
