@@ -6,15 +6,14 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tracking3d.config.camera import check_object_size
 from tracking3d.config.explain import nearest
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exporter import Exporter
-from tracking3d.export.formats import FORMATS
+from tracking3d.export.formats import FORMATS, Exporter
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.layout import ARBITRARY, EXPORT, OVERWRITE, check_run_folder, partial_path, run_files
 from tracking3d.runtime.progress import report_progress
@@ -33,19 +32,8 @@ _END_OF_TIME = 2.0**31
 _OUT = argument("out=", "--out")
 _TO = argument("to=", "--to")
 _NAMED = {
-    "object_size": argument("object_size=", "--object-size"),
-    "fps": argument("fps=", "--fps"),
-    "source": argument("source=", "--source"),
-    "of": argument("of=", "--of"),
-    "cut_out": argument("cut_out=", "--cut-out"),
-    "unseen": argument("unseen=", "--unseen"),
-    "undistorted": argument("undistorted=", "--undistorted"),
-    "images": argument("images=", "--no-images"),
-    "start_time": argument("start_time=", "--start-time"),
-    "compressed_images": argument("compressed_images=", "--compressed-images"),
-    "frame": argument("frame=", "--frame"),
-    "xy": argument("xy=", "--xy"),
-}
+    one.name: argument(f"{one.name}=", f"--{one.name.replace('_', '-')}") for one in fields(ExportOptions)
+} | {"images": argument("images=", "--no-images")}
 
 
 @dataclass(frozen=True)
