@@ -215,15 +215,7 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
         box_format=job.box_format,
     )
     return LongVideo(
-        job.video,
-        job.config,
-        work / RUN,
-        prompts,
-        job.split,
-        workers,
-        job.frames,
-        command,
-        resume=True,
+        job.video, job.config, work / RUN, prompts, job.split, workers, job.frames, command, resume=True
     )
 
 

@@ -238,37 +238,22 @@ def _remove(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
+# fmt: off
 OTHER_NAMES = {
-    "gltf": ("glb", "animated-glb"),
     **dict.fromkeys(("usd", "usda", "usdc"), ("usdz",)),
     **dict.fromkeys(("ros", "ros2", "rosbag", "bag", "db3"), ("ros-bag",)),
-    "obj": ("glb", "nuke"),
-    "fbx": ("animated-glb", "usdz"),
-    "abc": ("animated-glb", "usdz"),
-    "alembic": ("animated-glb", "usdz"),
-    "ae": ("after-effects",),
-    "jsx": ("after-effects",),
-    "chan": ("nuke",),
-    "blend": ("blender",),
-    "rrd": ("rerun",),
-    "mov": ("prores",),
-    "webm": ("vp9",),
-    "mp4": ("vp9", "prores"),
-    "video": ("vp9", "prores"),
-    "png": ("davis", "cut-outs"),
-    "masks": ("davis", "coco", "vot"),
-    "json": ("coco", "nerfstudio"),
-    "nerf": ("nerfstudio",),
-    "instant-ngp": ("nerfstudio",),
-    "gaussian-splatting": ("colmap",),
-    "3dgs": ("colmap",),
-    "trajectory": ("tum", "kitti"),
-    "txt": ("tum",),
-    "poses": ("csv", "tum", "bop"),
-    "points": ("points-csv", "tapvid"),
-    "npz": ("tapvid",),
-    "mesh": ("glb", "ply", "stl"),
+    **dict.fromkeys(("fbx", "abc", "alembic"), ("animated-glb", "usdz")),
+    **dict.fromkeys(("ae", "jsx"), ("after-effects",)),
+    **dict.fromkeys(("mp4", "video"), ("vp9", "prores")),
+    **dict.fromkeys(("nerf", "instant-ngp"), ("nerfstudio",)),
+    **dict.fromkeys(("gaussian-splatting", "3dgs"), ("colmap",)),
+    "gltf": ("glb", "animated-glb"), "obj": ("glb", "nuke"), "mesh": ("glb", "ply", "stl"),
+    "chan": ("nuke",), "blend": ("blender",), "rrd": ("rerun",), "mov": ("prores",), "webm": ("vp9",),
+    "png": ("davis", "cut-outs"), "masks": ("davis", "coco", "vot"), "json": ("coco", "nerfstudio"),
+    "trajectory": ("tum", "kitti"), "txt": ("tum",), "poses": ("csv", "tum", "bop"),
+    "points": ("points-csv", "tapvid"), "npz": ("tapvid",),
 }
+# fmt: on
 """By name in small letters, without a dot before it."""
 
 

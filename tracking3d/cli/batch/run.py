@@ -158,7 +158,7 @@ def run(
     from tracking3d.batch.listing import dataset_jobs, list_jobs
 
     if split is not None:
-        _check_split(split, config, out, data, engine.address)
+        _check_split(config, out, data, engine.address)
     if data is not None:
         from tracking3d.batch.datasets import dataset_reader
 
@@ -236,9 +236,7 @@ def _needs(videos: Sequence[VideoJob], engine: EngineOptions) -> Needs:
     return Needs(engine.threads, engine.memory or 0.0, 1.0 if gpus else 0.0)
 
 
-def _check_split(
-    split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
-) -> None:
+def _check_split(settings: PipelineConfig, out: str, data: Path | None, address: str | None) -> None:
     from tracking3d.batch.storage import local
     from tracking3d.pipeline.submaps.job import refuse_what_cannot_be_joined
 
