@@ -331,7 +331,7 @@ def _header(
         source_notes=source_notes(source),
         selection=options.selection,
         renderer=session.renderer,
-        given=given,
+        prompt=given,
         tracker_choice=opened.tracker_choice,
     )
 

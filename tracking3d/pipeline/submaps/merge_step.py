@@ -253,7 +253,7 @@ def _begin_writing(planned: PlannedVideo, opened: OpenTracking, whole: MergedMap
         fps=source.fps,
         command=video.command,
         selection=video.selection,
-        given=prompt_record(opened.first, one.prompt, source.count),
+        prompt=prompt_record(opened.first, one.prompt, source.count),
         tracker_choice=planned.choice,
     )
     return RunWriter(video.folder, header, overwrite=True)

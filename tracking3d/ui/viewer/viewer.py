@@ -21,8 +21,8 @@ from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results import layout
 from tracking3d.results.drawing import Colour
-from tracking3d.results.notes import doubtful_ranges
 from tracking3d.results.overlay import ObjectAxes
+from tracking3d.ui.sentences import doubtful_ranges
 from tracking3d.ui.viewer import timeline
 from tracking3d.ui.viewer.correcting import Corrections
 from tracking3d.ui.viewer.descriptions import about, describe_frame, list_doubtful_frames
