@@ -114,7 +114,7 @@ def read_failures(out: str) -> list[Failure]:
     content = read(join_path(out, FAILURES)) or b""
     try:
         return [
-            Failure(**row | {"attempts": int(row["attempts"]), "crashed": row["crashed"] == "True"})  # type: ignore[arg-type]
+            Failure(**row | {"attempts": int(row["attempts"]), "crashed": row["crashed"] == "True"})
             for row in csv.DictReader(io.StringIO(content.decode("utf-8")), strict=True)
         ]
     except (ValueError, KeyError, TypeError, csv.Error) as error:

@@ -206,7 +206,6 @@ def _check_prompts(jobs: str, videos: Sequence[VideoJob], quiet: bool) -> None:
         InputError: None of them has one.
     """
     from tracking3d.batch.listing import NO_PROMPT
-    from tracking3d.errors import InputError
 
     missing = [video for video in videos if video.fault == NO_PROMPT]
     if not missing:
