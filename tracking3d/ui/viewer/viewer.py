@@ -390,8 +390,3 @@ def look_through(
             client.camera.position, client.camera.wxyz = T_world_cam[:3, 3], rotation.wxyz
             wider = max(1.0, aspect / client.camera.aspect)  # what the panels leave may be narrow
             client.camera.fov = float(2 * np.arctan(wider * np.tan(np.radians(fov) / 2)))
-
-
-# Descriptions as HTML: a frame's estimate, the uncertain and lost frames, the run as a whole.
-#
-# All of it is text of files, and escaped.
