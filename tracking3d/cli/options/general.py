@@ -57,7 +57,7 @@ Sequences = Annotated[
 ]
 
 
-class Setting(OptionInfo):
+class KeyOption(OptionInfo):
     """An option that sets a key of the configuration, whose description begins with the help of the option.
 
     Args:
@@ -83,9 +83,9 @@ def settings_of(*groups: Any) -> dict[str, Any]:
     for group in groups:
         for name, hint in get_type_hints(type(group), include_extras=True).items():
             for option in get_args(hint):
-                if isinstance(option, Setting) and option.key:
+                if isinstance(option, KeyOption) and option.key:
                     given.setdefault(option.section, {})[option.key] = getattr(group, name)
-                elif isinstance(option, Setting):
+                elif isinstance(option, KeyOption):
                     given[option.section] = getattr(group, name)
     return given
 

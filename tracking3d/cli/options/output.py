@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import OUTPUT, PERFORMANCE, Setting
+from tracking3d.cli.options.general import OUTPUT, PERFORMANCE, KeyOption
 from tracking3d.errors import InputError
 
 
@@ -20,7 +20,7 @@ def _check(value: float | None) -> float | None:
 
 ObjectSize = Annotated[
     float | None,
-    Setting("object.size", "METRES", "--object-size", callback=_check, rich_help_panel=OUTPUT),
+    KeyOption("object.size", "METRES", "--object-size", callback=_check, rich_help_panel=OUTPUT),
 ]
 RunFolder = Annotated[
     Path | None,
@@ -109,8 +109,8 @@ class PerformanceOptions:
 
     PANEL: ClassVar = PERFORMANCE
 
-    size: Annotated[int | None, Setting("crop.size", "PIXELS")] = None
-    device: Annotated[str | None, Setting("runtime.device", "NAME")] = None
+    size: Annotated[int | None, KeyOption("crop.size", "PIXELS")] = None
+    device: Annotated[str | None, KeyOption("runtime.device", "NAME")] = None
     split: Annotated[
         str | None,
         typer.Option(

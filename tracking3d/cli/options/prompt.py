@@ -8,10 +8,10 @@ from typing import Annotated, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import PROMPT, Setting
+from tracking3d.cli.options.general import PROMPT, KeyOption
 from tracking3d.errors import InputError
 
-BoxFormat = Annotated[str | None, Setting("prompt.box_format", "xywh|xyxy", rich_help_panel=PROMPT)]
+BoxFormat = Annotated[str | None, KeyOption("prompt.box_format", "xywh|xyxy", rich_help_panel=PROMPT)]
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class PromptOptions:
 
     PANEL: ClassVar = PROMPT
 
-    box: Annotated[list[str] | None, Setting("prompt.box", "X,Y,W,H|FILE")] = None
+    box: Annotated[list[str] | None, KeyOption("prompt.box", "X,Y,W,H|FILE")] = None
     box_format: BoxFormat = None
-    mask: Annotated[list[Path] | None, Setting("prompt.mask", "FILE[@N|@all]")] = None
-    points: Annotated[list[str] | None, Setting("prompt.points", "'X,Y+ X,Y-'")] = None
+    mask: Annotated[list[Path] | None, KeyOption("prompt.mask", "FILE[@N|@all]")] = None
+    points: Annotated[list[str] | None, KeyOption("prompt.points", "'X,Y+ X,Y-'")] = None
     masks: Annotated[
         Path | None,
         typer.Option(
@@ -47,8 +47,8 @@ class PromptOptions:
             help="Track the object by itself, and make its model from this video and that of --object RUN.",
         ),
     ] = False
-    start_frame: Annotated[int | None, Setting("prompt.start_frame", "N")] = None
-    correct: Annotated[list[str] | None, Setting("prompt.correct", "FRAME:BOX|MASK|POINTS")] = None
+    start_frame: Annotated[int | None, KeyOption("prompt.start_frame", "N")] = None
+    correct: Annotated[list[str] | None, KeyOption("prompt.correct", "FRAME:BOX|MASK|POINTS")] = None
 
     def completed_from(self, config: Path | None) -> PromptOptions:
         """The same, with what the section ``prompt`` of a configuration file gives if the options do not.

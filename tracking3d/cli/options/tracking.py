@@ -8,11 +8,11 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import CAMERA, TRACKING, VIDEO, Setting, numbers
+from tracking3d.cli.options.general import CAMERA, TRACKING, VIDEO, KeyOption, numbers
 from tracking3d.errors import InputError
 
-Tracker = Annotated[str | None, Setting("tracker", "NAME", show_default="auto", rich_help_panel=TRACKING)]
-Features = Annotated[str | None, Setting("features", "NAME", rich_help_panel=TRACKING)]
+Tracker = Annotated[str | None, KeyOption("tracker", "NAME", show_default="auto", rich_help_panel=TRACKING)]
+Features = Annotated[str | None, KeyOption("features", "NAME", rich_help_panel=TRACKING)]
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,15 @@ class TrackingOptions:
 
     tracker: Tracker = None
     features: Features = None
-    flat: Annotated[bool | None, Setting("object.flat", None, "--flat")] = None
-    trust_masks: Annotated[bool | None, Setting("object.trust_masks", None, "--trust-masks")] = None
-    prototype: Annotated[str | None, Setting("object.prototype", "NAME|MESH")] = None
+    flat: Annotated[bool | None, KeyOption("object.flat", None, "--flat")] = None
+    trust_masks: Annotated[bool | None, KeyOption("object.trust_masks", None, "--trust-masks")] = None
+    prototype: Annotated[str | None, KeyOption("object.prototype", "NAME|MESH")] = None
     final_refine: Annotated[
         bool | None,
-        Setting("solver.final_refine", None, "--final-refine/--no-final-refine", show_default=False),
+        KeyOption("solver.final_refine", None, "--final-refine/--no-final-refine", show_default=False),
     ] = None
-    on_plugin_failure: Annotated[str | None, Setting("runtime.on_plugin_failure", "continue|stop")] = None
-    seed: Annotated[int | None, Setting("runtime.seed", "N")] = None
+    on_plugin_failure: Annotated[str | None, KeyOption("runtime.on_plugin_failure", "continue|stop")] = None
+    seed: Annotated[int | None, KeyOption("runtime.seed", "N")] = None
 
     def tracker_settings(self, masks: Path | None) -> dict[str, str | int | None]:
         """The section ``tracker`` of the configuration.
@@ -97,12 +97,12 @@ class CameraOptions:
 
     PANEL: ClassVar = CAMERA
 
-    fov: Annotated[float | None, Setting("camera.fov", "DEGREES")] = None
-    intrinsics: Annotated[str | None, Setting("camera.intrinsics", "FX,FY,CX,CY")] = None
-    distortion: Annotated[str | None, Setting("camera.distortion", "K1,K2,P1,P2,...|fisheye:K1,K2,K3,K4")] = (
-        None
-    )
-    camera_file: Annotated[str | None, Setting("camera.file", "FILE", "--camera")] = None
+    fov: Annotated[float | None, KeyOption("camera.fov", "DEGREES")] = None
+    intrinsics: Annotated[str | None, KeyOption("camera.intrinsics", "FX,FY,CX,CY")] = None
+    distortion: Annotated[
+        str | None, KeyOption("camera.distortion", "K1,K2,P1,P2,...|fisheye:K1,K2,K3,K4")
+    ] = None
+    camera_file: Annotated[str | None, KeyOption("camera.file", "FILE", "--camera")] = None
 
     def settings(self) -> dict[str, Any]:
         """The section ``camera`` of the configuration.

@@ -17,23 +17,8 @@ from tracking3d.errors import Tracking3dError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.passes import Listener
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
+from tracking3d.pipeline.submaps import merge_step
 from tracking3d.pipeline.submaps.job import LongVideo, SplitResult
-from tracking3d.pipeline.submaps.merge_step import (
-    AdjustJob,
-    FinishJob,
-    MaskJob,
-    MergedSubmaps,
-    MergeFailure,
-    PoseJob,
-    Retrack,
-    Tracked,
-    adjust_poses,
-    collect_masks,
-    decide_masks,
-    finish_run,
-    merge_parts,
-    solve_together,
-)
 from tracking3d.pipeline.submaps.plan import PlannedVideo, plan_video
 from tracking3d.pipeline.submaps.submap_runs import PartJob, Revisit, refine_submap, track_part
 from tracking3d.results.records import FrameRecord
@@ -204,18 +189,18 @@ def steps_of(planned: PlannedVideo) -> Steps:
         Step(track_part, job, f"part {number} of {of}", _frames(job)) for number, job in enumerate(jobs, 1)
     ]
     while True:
-        tracked = Tracked(planned, tuple(jobs), tuple(again), time.monotonic() - clock)
-        [found] = yield [Step(merge_parts, tracked, "merging its parts")]
-        if not isinstance(found, Retrack):
+        tracked = merge_step.Tracked(planned, tuple(jobs), tuple(again), time.monotonic() - clock)
+        [found] = yield [Step(merge_step.merge_parts, tracked, "merging its parts")]
+        if not isinstance(found, merge_step.Retrack):
             break
         jobs[found.number] = found.job
         again.append(found.number)
         yield [Step(track_part, found.job, f"part {found.number + 1} of {of} again", _frames(found.job))]
-    if isinstance(found, MergeFailure):
+    if isinstance(found, merge_step.MergeFailure):
         whole = [replace(job, resume=True, first_pass_only=False) for job in jobs]
         yield [Step(track_part, job, f"end of part {number} of {of}") for number, job in enumerate(whole, 1)]
         return SplitResult(tuple(job.folder for job in jobs), of, found.reason)
-    assert isinstance(found, MergedSubmaps)
+    assert isinstance(found, merge_step.MergedSubmaps)
     clock = time.monotonic()
     yield [
         Step(refine_submap, revisit, f"refinement pass {number} of {of}", _frames(revisit))
@@ -226,23 +211,25 @@ def steps_of(planned: PlannedVideo) -> Steps:
     return SplitResult((planned.video.folder,), of)
 
 
-def steps_to_the_end(merged: MergedSubmaps) -> Generator[list[Step], list[Any], None]:
+def steps_to_the_end(merged: merge_step.MergedSubmaps) -> Generator[list[Step], list[Any], None]:
     """The steps after all frames of a merged run have been refined."""
     precomputed, seconds = yield from _refine_in_parallel(merged)
     merged = replace(merged, seconds={**merged.seconds, **seconds})
-    yield [Step(finish_run, FinishJob(merged, precomputed), "writing its results")]
+    yield [Step(merge_step.finish_run, merge_step.FinishJob(merged, precomputed), "writing its results")]
 
 
 def _refine_in_parallel(
-    merged: MergedSubmaps,
+    merged: merge_step.MergedSubmaps,
 ) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
     """The final refinement of the parts: its last steps, and the seconds of each."""
     revisits, of, clock = merged.revisits, len(merged.revisits), time.monotonic()
     refined = merged.seconds["refine"] + merged.seconds["refinement_pass"]
-    [look] = yield [Step(solve_together, AdjustJob(revisits, refined), "global adjustment")]
+    [look] = yield [
+        Step(merge_step.solve_together, merge_step.AdjustJob(revisits, refined), "global adjustment")
+    ]
     settled = time.monotonic()
     placed = yield [
-        Step(adjust_poses, PoseJob(job, look), f"poses {number} of {of}")
+        Step(merge_step.adjust_poses, merge_step.PoseJob(job, look), f"poses {number} of {of}")
         for number, job in enumerate(revisits, 1)
     ]
     estimates = {record.index: record for part, _ in placed for record in part}
@@ -251,10 +238,10 @@ def _refine_in_parallel(
     if not merged.planned.config.object.segments_again:
         return PrecomputedRefinement(look, estimates, {}, retracked), seconds
     clock = time.monotonic()
-    masking = MaskJob(revisits[0], estimates, look, retracked)
-    [masks] = yield [Step(collect_masks, masking, "collecting its masks")]
+    masking = merge_step.MaskJob(revisits[0], estimates, look, retracked)
+    [masks] = yield [Step(merge_step.collect_masks, masking, "collecting its masks")]
     decided = yield [
-        Step(decide_masks, replace(masking, job=job, masks=masks), f"masks {number} of {of}")
+        Step(merge_step.decide_masks, replace(masking, job=job, masks=masks), f"masks {number} of {of}")
         for number, job in enumerate(revisits, 1)
     ]
     pictures = {index: mask for part in decided for index, mask in part.items()}
