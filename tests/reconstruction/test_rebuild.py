@@ -44,7 +44,7 @@ def written(folder: Path, yaws=YAWS, **changes) -> Path:
     given = {"first_frame": 0, "first_image_crc": checksum(frames[0].image)}
     run = folder / "run"
     header = RunHeader(
-        config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, given=given
+        config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, prompt=given
     )
     with RunWriter(run, header) as writer:
         for frame, estimate in zip(frames, estimates, strict=True):
