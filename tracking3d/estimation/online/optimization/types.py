@@ -55,8 +55,11 @@ class PoseFit:
     @staticmethod
     def of(found: EvaluatedPose, pose: Pose, iterations: int) -> PoseFit:
         """What was found, with its pose as the solver has poses."""
+        appearance, outline, points, overlap, unseen = found.details.tolist()
         information = torch.from_numpy(found.matrix).to(pose.translation)
-        return PoseFit(pose, found.cost, *found.details.tolist(), information, iterations)
+        return PoseFit(
+            pose, found.cost, appearance, outline, points, overlap, unseen, information, iterations
+        )
 
 
 PNP_DAMPING = Damping(first=1e-4, least=0.0, most=1e9, decrease=10, increase=10, converged=1e-6)
