@@ -34,19 +34,19 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14400,  # kernels of the joint fit; carried masks; restarts for live sources
+    "estimation": 14200,  # kernels of the joint fit; carried masks; restarts for live sources
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
-    "geometry": 2050,  # poses keep their matrices
+    "geometry": 2100,  # poses keep their matrices; the loop of Levenberg and Marquardt
     "modules": 450,
     "pipeline": 6900,  # what is tried when frames are lost; shapes get the memory of what tracked; carried masks
     "plugins": 850,  # the group of keypoint detectors
-    "points": 3600,
+    "points": 3650,  # the fit of one pose in a kernel
     "reconstruction": 3900,  # total variation in a kernel
     "rendering": 3850,  # depth without faces
     "results": 6800,
-    "runtime": 1150,
+    "runtime": 1200,  # logistic regressions from files
     "scene": 350,
     "testing": 1100,
     "trackers": 6350,  # holes of masks; frames that are skipped
