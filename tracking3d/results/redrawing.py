@@ -8,7 +8,13 @@ from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Frame, Image
 from tracking3d.results import layout
-from tracking3d.results.contact_sheet import CROPS, Thumbnails, crop_positions, draw_contact_sheet
+from tracking3d.results.contact_sheet import (
+    CROPS,
+    Thumbnail,
+    Thumbnails,
+    crop_positions,
+    draw_contact_sheet,
+)
 from tracking3d.results.files import write_image, writing
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.overlay import OverlaySize
@@ -16,28 +22,42 @@ from tracking3d.results.pictures import Pictures, kept_estimate
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import DEFAULT_FPS
 from tracking3d.video import open_source
+from tracking3d.video.image_file import read_image
 
 
-def redraw_contact_sheet(run: RunReader) -> None:
-    """Draw the contact sheet of a run again: with the crops of its overlay, and its model as it is now.
+def redraw_contact_sheet(run: RunReader, model: ObjectModel | None = None) -> None:
+    """Draw the contact sheet of a run again, with its model as it is now.
 
-    A run without an overlay, or that was killed, is left without change.
+    The crops are those of the present sheet, or if there is none of the overlay. A run without an overlay, or that was
+    killed, is left without change.
+
+    Args:
+        run: The run.
+        model: Its model, if it was read before.
 
     Raises:
         InputError: If the run is damaged.
         OutputError: If it cannot be written.
     """
-    records, size = run.frames, OverlaySize.of(run.camera)
-    positions, thumbnails = crop_positions(len(records)), Thumbnails()
-    for position, image in zip(positions, overlay_frames(run, positions), strict=False):
-        record = records[position]
-        estimate = kept_estimate(record, run.mask(record.index), None, run.camera)
-        thumbnails.keep(image[: size.picture], size.scale, estimate)
+    records, path, thumbnails = run.frames, run.folder / layout.CONTACT_SHEET, Thumbnails()
+    positions = crop_positions(len(records))
+    earlier = read_image(path) if path.is_file() else None
+    if earlier is not None:
+        shown = [records[position] for position in positions]
+        thumbnails.kept = [
+            Thumbnail(one.index, earlier, one.status, one.keyframe, one.T_cam_obj) for one in shown
+        ]
+    else:
+        size = OverlaySize.of(run.camera)
+        for position, image in zip(positions, overlay_frames(run, positions), strict=False):
+            record = records[position]
+            estimate = kept_estimate(record, run.mask(record.index), None, run.camera)
+            thumbnails.keep(image[: size.picture], size.scale, estimate)
     if thumbnails.kept and "counts" in run.description:
         replaced = {one.index for one in records if one.revision and not one.refined}
-        crops = thumbnails.spread(CROPS)
-        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced)
-        write_image(run.folder / layout.CONTACT_SHEET, sheet)
+        model = _model_of(run) if model is None else model
+        sheet = draw_contact_sheet(thumbnails.spread(CROPS), model, run.description, replaced, earlier)
+        write_image(path, sheet)
 
 
 def redraw_overlay(run: RunReader, frames: Iterable[Frame]) -> None:
