@@ -209,7 +209,7 @@ class OnlineSolver:
             if not atlas.is_fully_visible(mask) or not atlas.colours_match(state, frame, mask):
                 return replace(state, reinitialization=None), estimate
             begun, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
-            return replace(state, reinitialization=begun), estimate
+            return replace(state, reinitialization=replace(begun, needs_points=True)), estimate
         second, again = self.initializer.add(begun, frame, image, mask)
         if isinstance(second, Initializing):
             return replace(state, reinitialization=second), estimate

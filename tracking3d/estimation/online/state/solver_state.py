@@ -78,6 +78,7 @@ class Initializing(_AnyState):
     # (3,) the object's rotation in that initialization as a rotation vector, or None
     ambiguous_rotation: NDArray[np.float64] | None = None
     waiting_reason: str = ""  # why the initialization waits, if not for motion
+    needs_points: bool = False  # whether a map without points is of no use, as beside another map
     # the initialization that is computed in another thread, if there is one; see
     # `tracking3d.estimation.online.initializer`
     background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
