@@ -168,6 +168,12 @@ def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float6
     )
 
 
+def without_masks(estimate: FrameEstimate) -> FrameEstimate:
+    """An estimate without what takes much memory."""
+    nothing = np.zeros((0, 0), bool)
+    return replace(estimate, mask=nothing, initial_mask=None, probability=None, revised=())
+
+
 def mark_failed(estimate: FrameEstimate, failure: str) -> FrameEstimate:
     """The estimate of a frame in which a plug-in failed: at most uncertain, with half the confidence.
 
