@@ -415,8 +415,10 @@ class Initializer:
             if all(view.index != other.index for other in state.object_map.keyframes):
                 shown = resect_pose(state.object_map, state.camera, view, pose)
                 estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
+            state = learn_colours(state, estimate, found)
+            if not self.observer.config.runtime.probabilities:  # of all frames at once they take much memory
+                estimate = replace(estimate, probability=None)
             revised.append(estimate)
-            state = learn_colours(state, revised[-1], found)
         if not trail:
             return state, revised, trail
         return replace(
