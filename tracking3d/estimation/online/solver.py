@@ -168,6 +168,8 @@ class OnlineSolver:
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
         if state.revisable:
             updated = replace(updated, revisable=thin_out((*state.revisable, (found.view, plain))))
+        if state.background is not None:
+            state.background.add((found.view, plain))
         if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         if not (found.lost or is_keyframe):
