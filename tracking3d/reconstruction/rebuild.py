@@ -247,7 +247,7 @@ def _replace_mesh(run: RunReader, model: ObjectModel) -> None:
     if "notes" in run.description:
         note_in_run(run.folder, {"notes": notes_of_run(run.description, model, run.frames)})
     if (run.folder / layout.CONTACT_SHEET).is_file():
-        redraw_contact_sheet(RunReader(run.folder), model)
+        redraw_contact_sheet(RunReader(run.folder))
 
 
 def online_model(run: RunReader) -> ObjectModel:

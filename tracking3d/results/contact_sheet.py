@@ -110,14 +110,10 @@ def draw_contact_sheet(
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
     """
-    if earlier is None:
-        tiles = [_add_label(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
-    else:
-        corners = [
-            (TILE * row, TILE * column)
-            for row, column in (divmod(n, COLUMNS) for n in range(len(thumbnails)))
-        ]
-        tiles = [earlier[top : top + TILE, left : left + TILE] for top, left in corners]
+    tiles = [_add_label(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
+    if earlier is not None:
+        grid = earlier[: len(earlier) // TILE * TILE].reshape(-1, TILE, COLUMNS, TILE, 3).swapaxes(1, 2)
+        tiles = [*grid.reshape(-1, TILE, TILE, 3)[: len(tiles)]]
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     if model is not None:
         texture = np.where((model.texture_weight > 0)[..., None], model.texture, model.texture // 3 + 40)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import repeat
+
+import numpy as np
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Frame, Image
 from tracking3d.results import layout
-from tracking3d.results.contact_sheet import (
-    CROPS,
-    Thumbnail,
-    Thumbnails,
-    crop_positions,
-    draw_contact_sheet,
-)
+from tracking3d.results.contact_sheet import CROPS, Thumbnails, crop_positions, draw_contact_sheet
 from tracking3d.results.files import write_image, writing
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.overlay import OverlaySize
@@ -25,38 +22,29 @@ from tracking3d.video import open_source
 from tracking3d.video.image_file import read_image
 
 
-def redraw_contact_sheet(run: RunReader, model: ObjectModel | None = None) -> None:
+def redraw_contact_sheet(run: RunReader) -> None:
     """Draw the contact sheet of a run again, with its model as it is now.
 
     The crops are those of the present sheet, or if there is none of the overlay. A run without an overlay, or that was
     killed, is left without change.
 
-    Args:
-        run: The run.
-        model: Its model, if it was read before.
-
     Raises:
         InputError: If the run is damaged.
         OutputError: If it cannot be written.
     """
-    records, path, thumbnails = run.frames, run.folder / layout.CONTACT_SHEET, Thumbnails()
-    positions = crop_positions(len(records))
-    earlier = read_image(path) if path.is_file() else None
-    if earlier is not None:
-        shown = [records[position] for position in positions]
-        thumbnails.kept = [
-            Thumbnail(one.index, earlier, one.status, one.keyframe, one.T_cam_obj) for one in shown
-        ]
-    else:
-        size = OverlaySize.of(run.camera)
-        for position, image in zip(positions, overlay_frames(run, positions), strict=False):
-            record = records[position]
-            estimate = kept_estimate(record, run.mask(record.index), None, run.camera)
-            thumbnails.keep(image[: size.picture], size.scale, estimate)
+    records, size, path = run.frames, OverlaySize.of(run.camera), run.folder / layout.CONTACT_SHEET
+    positions, thumbnails = crop_positions(len(records)), Thumbnails()
+    earlier, unseen = read_image(path) if path.is_file() else None, np.zeros((1, 1), bool)
+    images = overlay_frames(run, positions) if earlier is None else repeat(earlier)
+    for position, image in zip(positions, images, strict=False):
+        record = records[position]
+        mask = run.mask(record.index) if earlier is None else unseen
+        estimate = kept_estimate(record, mask, None, run.camera)
+        thumbnails.keep(image[: size.picture], size.scale, estimate)
     if thumbnails.kept and "counts" in run.description:
         replaced = {one.index for one in records if one.revision and not one.refined}
-        model = _model_of(run) if model is None else model
-        sheet = draw_contact_sheet(thumbnails.spread(CROPS), model, run.description, replaced, earlier)
+        crops = thumbnails.spread(CROPS)
+        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced, earlier)
         write_image(path, sheet)
 
 
