@@ -128,7 +128,8 @@ class VideoSegmenter:
         self._seen.append(frame.index)
         if not pose_weight(frame.confidence):  # such a pose redraws nothing
             self.kept.add(frame.index)
-        wanted, may_keep = frame.index in self._wanted, frame.index in self._may_keep
+        wanted = frame.index in self._wanted
+        may_keep = frame.index in self._may_keep and frame.index not in self.kept
         if not (wanted or may_keep) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = frame if isinstance(frame, Drawn) else self._scene(frame)
