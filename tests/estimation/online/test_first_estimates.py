@@ -146,6 +146,7 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted():
     state, answers = run_to(AGAIN + 1, small_solver())
     at_once, *later = answers[AGAIN:]
     assert [one.index for one in at_once.revised] == list(range(AGAIN))
+    assert all(one.probability is None for one in at_once.revised), "of all at once they take much memory"
     assert all(not one.revised for one in later)
     assert state.revisable == ()
     # Without points all keyframes have the contrast among their features, also those that came after the start.

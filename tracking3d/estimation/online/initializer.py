@@ -229,6 +229,9 @@ class Initializer:
     def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
         observer, camera = self.observer, self.observer.camera
+        known = [view.strength for view in state.object_map.keyframes if view.strength < np.inf]
+        if state.object_map.pointless and known and not has_texture(known):
+            return state, PhotoEstimates((), _PLAIN)
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
@@ -246,9 +249,10 @@ class Initializer:
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
             found.append(Photo.of(frame.index, grey(frame.image), binary, observer.detector))
             strengths.append(texture_strength(grey(frame.image), binary))
-        start = start_of_photos(found, camera)
-        if begun is None or start.structure is None:
-            reason = start.reason if has_texture(strengths) or not found else _PLAIN
+        plain = bool(found) and not has_texture(strengths)  # no pair of photos is worth matching
+        start = None if plain else start_of_photos(found, camera)
+        if begun is None or start is None or start.structure is None:
+            reason = _PLAIN if start is None else start.reason
             if isinstance(state, Initializing):
                 state = replace(state, waiting_reason=reason)
             return state, PhotoEstimates((), reason)
@@ -438,8 +442,10 @@ class Initializer:
             if all(view.index != other.index for other in state.object_map.keyframes):
                 shown = resect_pose(state.object_map, state.camera, view, pose)
                 estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
+            state = learn_colours(state, estimate, found)
+            if not self.observer.config.runtime.probabilities:  # of all frames at once they take much memory
+                estimate = replace(estimate, probability=None)
             revised.append(estimate)
-            state = learn_colours(state, revised[-1], found)
         if not trail:
             return state, revised, trail
         return replace(

@@ -80,6 +80,7 @@ class Initializing(_AnyState):
     # (3,) the object's rotation in that initialization as a rotation vector, or None
     ambiguous_rotation: NDArray[np.float64] | None = None
     waiting_reason: str = ""  # why the initialization waits, if not for motion
+    needs_points: bool = False  # whether a map without points is of no use, as beside another map
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
