@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import repeat
-
-import numpy as np
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Frame, Image
 from tracking3d.results import layout
-from tracking3d.results.contact_sheet import CROPS, Thumbnails, crop_positions, draw_contact_sheet
+from tracking3d.results.contact_sheet import COLUMNS, CROPS, Thumbnails, crop_positions, draw_contact_sheet
 from tracking3d.results.files import write_image, writing
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.overlay import OverlaySize
@@ -23,10 +20,9 @@ from tracking3d.video.image_file import read_image
 
 
 def redraw_contact_sheet(run: RunReader) -> None:
-    """Draw the contact sheet of a run again, with its model as it is now.
+    """Draw the contact sheet of a run again: with its crops, or those of its overlay, and its model as it is now.
 
-    The crops are those of the present sheet, or if there is none of the overlay. A run without an overlay, or that was
-    killed, is left without change.
+    A run without an overlay, or that was killed, is left without change.
 
     Raises:
         InputError: If the run is damaged.
@@ -34,17 +30,19 @@ def redraw_contact_sheet(run: RunReader) -> None:
     """
     records, size, path = run.frames, OverlaySize.of(run.camera), run.folder / layout.CONTACT_SHEET
     positions, thumbnails = crop_positions(len(records)), Thumbnails()
-    earlier, unseen = read_image(path) if path.is_file() else None, np.zeros((1, 1), bool)
-    images = overlay_frames(run, positions) if earlier is None else repeat(earlier)
+    earlier = read_image(path) if path.is_file() else None
+    images = overlay_frames(run, positions) if earlier is None else [earlier] * len(positions)
     for position, image in zip(positions, images, strict=False):
         record = records[position]
-        mask = run.mask(record.index) if earlier is None else unseen
-        estimate = kept_estimate(record, mask, None, run.camera)
+        estimate = kept_estimate(record, run.mask(record.index), None, run.camera)
         thumbnails.keep(image[: size.picture], size.scale, estimate)
     if thumbnails.kept and "counts" in run.description:
         replaced = {one.index for one in records if one.revision and not one.refined}
         crops = thumbnails.spread(CROPS)
-        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced, earlier)
+        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced)
+        if earlier is not None:
+            rows = -(-len(crops) // COLUMNS) * len(crops[0].image)
+            sheet[:rows] = earlier[:rows]
         write_image(path, sheet)
 
 

@@ -301,6 +301,15 @@ def test_a_second_map_is_given_up_where_only_one_without_points_can_be_made(aske
     assert not asked["turning"]
 
 
+def test_whether_a_map_would_have_points_is_told_without_fitting_one_that_has_none(asked):
+    given = belief_of(list(np.linspace(0, 60, 13)))
+    plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)
+    maker = initializer.Initializer(None, CONFIG, in_background=False)
+    assert maker.has_points(given, ended=True)
+    assert not maker.has_points(replace(given, pending=plain), ended=True)
+    assert not asked["turning"]
+
+
 def test_a_start_without_points_sees_the_contrast_of_small_marks(monkeypatch):
     given = belief_of(list(np.linspace(0, 60, 13)))
     plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)

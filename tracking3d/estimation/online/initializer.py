@@ -221,7 +221,8 @@ class Initializer:
     def has_points(self, state: SolverState, ended: bool) -> bool:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
         if isinstance(state, Initializing):
-            start = try_initialize(state, self.options, ended=True)[1] if ended else None
+            asked = replace(state, needs_points=True)  # else it is fitted here and in `finish`
+            start = try_initialize(asked, self.options, ended=True)[1] if ended else None
             return start is not None and not start.object_map.pointless
         maps = [state.object_map, *(other.object_map for other in state.inactive_maps)]
         return not all(one.pointless for one in maps)
