@@ -20,6 +20,7 @@ class Evaluated(Protocol):
 class Damping(NamedTuple):
     """How the damping goes on, and when the loop ends. A named tuple, which kernels can take."""
 
+    # Unless a problem says otherwise, as chosen for poses of frames, whose cost is a mean of robust losses
     first: float = 1e-3  # share of each diagonal entry that is added to it
     least: float = 1e-6
     most: float = 1e3  # above it, no step is expected to gain anything
@@ -27,9 +28,8 @@ class Damping(NamedTuple):
     increase: float = 8.0  # factor after one that does not
     converged: float = 1e-4  # share of the cost below which a gain is small
     small_gains: int = 1  # in a row that end the loop
-    tries: int = (
-        0  # steps without gain in a row that end it, whatever is left of the iterations; 0: no such number
-    )
+    # Steps without gain in a row that end it, and are tried whatever is left of the iterations; 0: no such number
+    tries: int = 0
 
 
 S = TypeVar("S", bound=Evaluated)

@@ -24,7 +24,7 @@ from tracking3d.points.bundle_adjustment.reprojection import (
     transform_to_camera,
 )
 
-_DAMPING = Damping(least=1e-9, most=1e9, decrease=10, increase=10, tries=6)
+_DAMPING = Damping(least=1e-9, most=1e9, decrease=10, increase=10, tries=6)  # chosen
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ from tracking3d.rendering.surface import edges_of
 _APPEARANCE = 4.0  # weight of the mean photometric loss
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
-# A single small gain often means only that the damping was too high
+# Chosen; a single small gain often means only that the damping was too high
 _DAMPING = Damping(first=1e-2, least=1e-5, decrease=2, increase=4, small_gains=3)
 
 

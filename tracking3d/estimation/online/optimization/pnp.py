@@ -77,10 +77,10 @@ def pose_of_tracks(
         scale: Residual in pixels at which the loss is ``log 2``.
         iterations: The most steps that are tried.
     """
-    from tracking3d.estimation.online.optimization.kernels import pnp
+    from tracking3d.estimation.online.optimization.kernels import pose_refinement
 
     share = _shares(points, pixels, weight)
-    return pnp.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
+    return pose_refinement.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
 
 
 def _shares(points: FloatArray, pixels: FloatArray, weight: FloatArray | None) -> FloatArray:

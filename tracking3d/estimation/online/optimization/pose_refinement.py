@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.optimization.types import NOTHING_SEEN, PoseFit, PoseWeights
+from tracking3d.estimation.online.optimization.types import NOTHING_SEEN, EvaluatedPoses, PoseFit, PoseWeights
 from tracking3d.geometry.levenberg_marquardt import Damping, minimizer
 from tracking3d.geometry.pose import Pose, from_matrix
 from tracking3d.points.bundle_adjustment.reprojection import EvaluatedPose, FloatArray, apply_pose_steps
@@ -87,27 +87,27 @@ def refine_poses(
     R, t, spent = first_R, first_t, np.zeros(len(starts), np.int64)
     for level, steps in zip(levels[::-1], iterations, strict=True):
         if steps or level is levels[0]:
-            found, tried = zip(*_minimize(level, R, t, steps), strict=True)
-            R, t = (np.stack(part) for part in ([fit.R for fit in found], [fit.t for fit in found]))
-            spent += 1 + np.array(tried)
+            found = _minimize(level, R, t, steps)
+            R, t, spent = found.R, found.t, spent + found.tried + 1
     moved = np.not_equal(R, first_R).any((1, 2)) | np.not_equal(t, first_t).any(1)
     return [
-        PoseFit.of(fit, from_matrix(*_on_device(surface, fit.R, fit.t)) if moved[n] else start, int(spent[n]))
-        for n, (start, fit) in enumerate(zip(starts, found, strict=True))
+        PoseFit.of(
+            found, n, from_matrix(*_on_device(surface, R[n], t[n])) if moved[n] else start, int(spent[n])
+        )
+        for n, start in enumerate(starts)
     ]
 
 
-def _minimize(
-    evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int
-) -> list[tuple[EvaluatedPose, int]]:
-    """Poses ``(B, 3, 3)`` and ``(B, 3)`` fitted at one resolution, with the numbers of steps tried."""
+def _minimize(evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int) -> EvaluatedPoses:
+    """Poses ``(B, 3, 3)`` and ``(B, 3)`` fitted at one resolution."""
     surface, target = evidence.surface, evidence.observation.target
     if use_numba(surface.renderer, surface.vertices, surface.texture, target.features):
         from tracking3d.estimation.online.optimization.kernels import pose_refinement
 
         return pose_refinement.minimize(surface, target, evidence.matched, evidence.weights, R, t, steps)
     minimize = minimizer(_model, _step)
-    return [minimize(evidence, start, Damping(), steps) for start in _evaluate(evidence, R, t)]
+    found = [minimize(evidence, start, Damping(), steps) for start in _evaluate(evidence, R, t)]
+    return EvaluatedPoses(*map(np.stack, zip(*((*fit, tried) for fit, tried in found), strict=True)))
 
 
 def _model(evidence: _Evidence, at: EvaluatedPose) -> NormalEquations:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from tracking3d.config.models import OnlineConfig
 from tracking3d.geometry.levenberg_marquardt import Damping
 from tracking3d.geometry.pose import Pose
-from tracking3d.points.bundle_adjustment.reprojection import EvaluatedPose, FloatArray
+from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 
 NOTHING_SEEN = 1.0
 """What a pose costs that shows nothing comparable, above one that shows unseen texture only."""
@@ -53,13 +54,25 @@ class PoseFit:
     iterations: int  # evaluations spent
 
     @staticmethod
-    def of(found: EvaluatedPose, pose: Pose, iterations: int) -> PoseFit:
-        """What was found, with its pose as the solver has poses."""
-        appearance, outline, points, overlap, unseen = found.details.tolist()
-        information = torch.from_numpy(found.matrix).to(pose.translation)
+    def of(found: EvaluatedPoses, n: int, pose: Pose, iterations: int) -> PoseFit:
+        """One of several, with its pose as the solver has poses."""
+        appearance, outline, points, overlap, unseen = found.details[n].tolist()
+        information = torch.from_numpy(found.matrix[n]).to(pose.translation)
         return PoseFit(
-            pose, found.cost, appearance, outline, points, overlap, unseen, information, iterations
+            pose, float(found.cost[n]), appearance, outline, points, overlap, unseen, information, iterations
         )
+
+
+class EvaluatedPoses(NamedTuple):
+    """B poses, each as `EvaluatedPose` has it. A named tuple, for kernels."""
+
+    cost: FloatArray
+    R: FloatArray
+    t: FloatArray
+    details: FloatArray
+    matrix: FloatArray
+    gradient: FloatArray
+    tried: NDArray[np.int64]  # (B,) steps that led to them
 
 
 PNP_DAMPING = Damping(first=1e-4, least=0.0, most=1e9, decrease=10, increase=10, converged=1e-6)
