@@ -30,7 +30,7 @@ FULLER_FOLDERS = {"export": 31}
 ROOM_LINES = {
     "__main__": 50,
     "batch": 2150,
-    "cli": 4700,
+    "cli": 4650,
     "config": 1450,
     "engines": 900,
     "errors": 50,
