@@ -24,13 +24,13 @@ SMALL_MODULE = 120
 
 MOST_LONE_SMALL_MODULES = 21
 MODULES_IN_A_FOLDER = 25
-FULLER_FOLDERS = {"export": 32}
+FULLER_FOLDERS = {"export": 31}
 """Folders that hold more today, with their numbers; `export` has a file for each format."""
 
 ROOM_LINES = {
     "__main__": 50,
     "batch": 2150,
-    "cli": 4700,
+    "cli": 4650,
     "config": 1450,
     "engines": 900,
     "errors": 50,

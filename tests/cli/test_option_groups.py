@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import pytest
 import typer
@@ -22,6 +22,16 @@ class Shape:
 @dataclass(frozen=True)
 class Paint:
     colour: Annotated[str, typer.Option(help="Colour.")] = "red"
+
+
+@dataclass(frozen=True)
+class Lens:
+    PANEL: ClassVar = general.CAMERA
+
+    fov: Annotated[float | None, general.KeyOption("camera.fov", "DEGREES")] = None
+    tracker: Annotated[str | None, general.KeyOption("tracker", "NAME", rich_help_panel="Other")] = None
+    flat: Annotated[bool | None, general.KeyOption("object.flat", None, "--flat")] = None
+    out: Annotated[str, typer.Option(help="Where.")] = ""
 
 
 def called(*words: str) -> tuple[object, ...]:
@@ -93,3 +103,22 @@ def test_an_option_stands_in_the_same_panel_in_every_command(command):
     assert shared
     for parameter in shared:
         assert parameter.rich_help_panel == SHARED[parameter.opts[0]], parameter.opts[0]
+
+
+def test_an_option_that_sets_a_key_has_its_description_and_the_panel_of_its_group():
+    @grouped
+    def draw(lens: Lens) -> None: ...
+
+    program = typer.Typer()
+    program.command()(draw)
+    fov, tracker, *_ = typer.main.get_command(program).params
+    assert fov.help == "Vertical field of view in degrees."  # the first sentence of two
+    assert (fov.rich_help_panel, tracker.rich_help_panel) == (general.CAMERA, "Other")
+
+
+def test_options_that_set_keys_are_collected_by_section():
+    assert general.settings_of(Lens(fov=40.0, flat=True), Paint()) == {
+        "camera": {"fov": 40.0},
+        "tracker": None,
+        "object": {"flat": True},
+    }

@@ -11,7 +11,7 @@ from tracking3d.estimation.segmentation import (
     ColourModels,
     as_lab,
     clean_mask,
-    in_question,
+    image_weight,
     log_odds,
     pixel_features,
     snap_to_edges,
@@ -38,7 +38,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 def decided(image, initial, rendered, confidence=0.8, colours=None) -> np.ndarray:
     found = pixel_features(as_lab(image), initial, rendered, confidence, colours)
-    return snap_to_edges(image, log_odds(found), in_question(found)) > 0
+    return snap_to_edges(image, log_odds(found), image_weight(found)) > 0
 
 
 def test_where_both_outlines_agree_the_image_is_hardly_asked():
@@ -46,7 +46,7 @@ def test_where_both_outlines_agree_the_image_is_hardly_asked():
     truth = disc(64)
     soft = cv2.GaussianBlur(picture(truth), (0, 0), 4)
     asked = [
-        in_question(pixel_features(as_lab(soft), truth, disc(64 + off), 0.8, None)) for off in (0, 1, 3, 30)
+        image_weight(pixel_features(as_lab(soft), truth, disc(64 + off), 0.8, None)) for off in (0, 1, 3, 30)
     ]
     assert asked == sorted(asked) and asked[0] == 0 and asked[-1] == 1
     assert iou(decided(soft, truth, disc(64.5)), truth) > 0.97

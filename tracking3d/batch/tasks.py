@@ -138,20 +138,7 @@ def begin_in_parts(
     workers: int,
     networks: tuple[SharedNetwork, ...] = (),
 ) -> PlannedVideo | dict[str, Any]:
-    """Cut a video; a video that is a single submap is tracked here, and the result is that of `put_away`.
-
-    Args:
-        tell: See `tracking3d.batch.one_video.track_video`.
-        job: The video.
-        out: The folder of the batch.
-        command: The command line, for the record.
-        report: Whether to write a report.
-        workers: Number of workers of the batch, for the record.
-        networks: What the machine may lack.
-
-    Raises:
-        Tracking3dError: If it cannot be cut or tracked; finished frames are kept for the next attempt.
-    """
+    """Cut a video; a video that is a single submap is tracked here, and the result is that of `put_away`."""
     with local_work_folder(job, out, networks) as work:
         attempts = count_attempt(work)
         planned = plan_video(
@@ -165,19 +152,7 @@ def begin_in_parts(
 def step_in_parts(
     tell: Reporter, job: VideoJob, out: str, step: Step, whole: int, networks: tuple[SharedNetwork, ...] = ()
 ) -> Any:
-    """Do one step and return its result.
-
-    Args:
-        tell: See `tracking3d.batch.one_video.track_video`; ``share`` is that of the whole video.
-        job: The video.
-        out: The folder of the batch.
-        step: What is to be done.
-        whole: Estimates of the whole video.
-        networks: What the machine may lack.
-
-    Raises:
-        Tracking3dError: If it fails; finished frames are kept for the next attempt.
-    """
+    """Do one step and return its result; ``whole`` is the number of estimates of the whole video."""
 
     def with_share(content: dict[str, Any]) -> None:
         tell({**content, "share": content["frames"] / whole})
@@ -189,19 +164,7 @@ def step_in_parts(
 def settle_in_parts(
     tell: Reporter, job: VideoJob, out: str, report: bool, ended: SplitResult, again: int
 ) -> dict[str, Any]:
-    """Put what became of a video into its place.
-
-    Args:
-        tell: Not used.
-        job: The video.
-        out: The folder of the batch.
-        report: Whether to write reports.
-        ended: Its run, or its parts'.
-        again: How often steps of it were tried again.
-
-    Raises:
-        OutputError: If something cannot be written.
-    """
+    """Put what became of a video into its place; ``again`` is how often steps of it were tried again."""
     with local_work_folder(job, out) as work:
         attempts = max(count_earlier_attempts(work), 1) + again
         return put_away(job, out, work, ended.folders, report, attempts, _note(ended))

@@ -20,15 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ContentOptions:
-    """What of a run is exported."""
+    """What of a run is exported; fields as of `ExportOptions`, as are those of the next group."""
 
     PANEL: ClassVar = "Content"
 
-    estimates: Annotated[
+    answers: Annotated[
         str,
-        typer.Option(
-            "--answers", metavar="causal|final", help="Estimates before or after the final refinement."
-        ),
+        typer.Option(metavar="causal|final", help="Estimates before or after the final refinement."),
     ] = "final"
     object_size: ObjectSize = None
     of: Annotated[
@@ -158,22 +156,11 @@ def _print_export(done: Export, as_json: bool, quiet: bool) -> None:
 def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOptions:
     from tracking3d.export.options import ExportOptions
 
-    pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in content.xy or ())
-    return ExportOptions(
-        answers=content.estimates,  # type: ignore[arg-type] # the exporter checks the texts
-        object_size=content.object_size,
-        fps=video.fps,
-        source=video.source,
-        start_time=None if video.start_time is None else _seconds(video.start_time),
-        compressed_images=content.compressed_images,
-        of=content.of,  # type: ignore[arg-type]
-        cut_out=content.cut_out,
-        unseen=content.unseen,  # type: ignore[arg-type]
-        images=content.images,
-        undistorted=content.undistorted,
-        frame=content.frame,
-        xy=pixels,  # type: ignore[arg-type]
-    )
+    given = {
+        "xy": tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in content.xy or ()),
+        "start_time": None if video.start_time is None else _seconds(video.start_time),
+    }
+    return ExportOptions(**vars(content) | vars(video) | given)
 
 
 def _seconds(text: str) -> float:

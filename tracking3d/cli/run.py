@@ -63,7 +63,7 @@ def run(
     performance.check()
     check_source_name(source)
     validate_fps(video.fps)
-    check_files(prompt, tracking.prototype)
+    _check_files(prompt, tracking.prototype)
     if prompt.known is not None and not prompt.extend and output.object_size is not None:
         raise InputError("A known object has its own unit; leave out --object-size, or --object.")
     prompts = _parse_prompts(prompt, video.frames)
@@ -72,8 +72,8 @@ def run(
         config = _configure(prompt, camera, tracking, settings, output, performance)
     check_model_source(settings.model, source)
     folder = output.out or default_folder(source)
-    check_known(config, len(prompts), performance.split is not None)
-    check_extended(config, len(prompts), performance.split is not None)
+    _check_known(config, len(prompts), performance.split is not None)
+    _check_extended(config, len(prompts), performance.split is not None)
     if (
         not prompts
         and needs_prompt(config)
@@ -95,7 +95,7 @@ def run(
     request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
     split = performance.split
-    start = track if split is None else partial(track_in_parts, length=split, workers=performance.workers)
+    start = track if split is None else partial(_track_in_parts, length=split, workers=performance.workers)
     if not asks:
         return start(request, display)
     configure = partial(_configure_in_browser, prompt, output, performance)
@@ -159,8 +159,8 @@ def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     start = prompt.start_frame
     first = start if start is not None else parse_selection(frames).start
     box_format = check_box_format(prompt.box_format)
-    boxes = [parse_given_box(text, first, box_format) for text in prompt.box or ()]
-    masks = [one for file in prompt.mask or () for one in parse_given_masks(file)]
+    boxes = [_parse_given_box(text, first, box_format) for text in prompt.box or ()]
+    masks = [one for file in prompt.mask or () for one in _parse_given_masks(file)]
     points = [parse_points(text) for text in prompt.points or ()]
     several = len(boxes) + len(masks) + len(points) > 1
     return PromptSet(boxes, masks, points, start, as_lists=several, box_format=box_format)
@@ -183,18 +183,8 @@ def _command() -> str:
     return shlex.join(["tracking3d", *map(without_password, sys.argv[1:])])
 
 
-def track_in_parts(request: RunRequest, display: RunDisplay, length: str, workers: int | None) -> None:
-    """Track a video in parts, show the progress, and print a summary.
-
-    Args:
-        request: What is tracked.
-        display: What is shown.
-        length: Length of a part, as ``--split`` has it.
-        workers: Processes at the same time; one per processor if None.
-
-    Raises:
-        InputError: Options do not go together.
-    """
+def _track_in_parts(request: RunRequest, display: RunDisplay, length: str, workers: int | None) -> None:
+    """Track a video in parts of a ``length`` as --split has it, show the progress, and print a summary."""
     from tracking3d.cli.progress import plan_run, show_progress
     from tracking3d.cli.report import report_at_end
     from tracking3d.pipeline.submaps.split_run import record_in_parts
@@ -287,17 +277,8 @@ def _resumable(folder: Path) -> Iterator[None]:
 _ALL = "@all"
 
 
-def parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Box:
-    """Read a box, or the box of frame ``frame`` in a file in VOT's region format.
-
-    Args:
-        text: Four numbers, or the path of the file.
-        frame: Index of the frame.
-        box_format: What the four numbers are.
-
-    Raises:
-        InputError: The text is neither.
-    """
+def _parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Box:
+    """Read a box, or the box of frame ``frame`` in a file in VOT's region format."""
     from tracking3d.trackers.prompts.boxes import parse_box
 
     if Path(text).is_file():
@@ -307,12 +288,8 @@ def parse_given_box(text: str, frame: int, box_format: BoxFormat = "xywh") -> Bo
     return parse_box(text, box_format=box_format)
 
 
-def parse_given_masks(file: Path) -> list[Path]:
-    """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
-
-    Raises:
-        InputError: The file does not exist, or the image shows no object.
-    """
+def _parse_given_masks(file: Path) -> list[Path]:
+    """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``."""
     from tracking3d.trackers.mask_images import objects_in, split_object
 
     name = str(file)
@@ -329,12 +306,8 @@ def parse_given_masks(file: Path) -> list[Path]:
     return [Path(f"{image}@{number}") for number in numbers]
 
 
-def check_files(prompt: PromptOptions, prototype: str | None) -> None:
-    """Make sure that what ``--masks``, ``--object`` and ``--prototype`` name exists, before anything reads it.
-
-    Raises:
-        InputError: One does not.
-    """
+def _check_files(prompt: PromptOptions, prototype: str | None) -> None:
+    """Make sure that what --masks, --object and --prototype name exists, before anything reads it."""
     from tracking3d.trackers.mask_images import split_object
 
     if prompt.masks is not None and not split_object(prompt.masks)[0].exists():
@@ -356,12 +329,8 @@ def check_files(prompt: PromptOptions, prototype: str | None) -> None:
         )
 
 
-def check_known(settings: PipelineConfig, objects: int, split: bool) -> None:
-    """Make sure that the other options go with ``--object``.
-
-    Raises:
-        InputError: One of them does not.
-    """
+def _check_known(settings: PipelineConfig, objects: int, split: bool) -> None:
+    """Make sure that the other options go with --object."""
     if settings.object.model is None:
         return
     from tracking3d.pipeline.validation import check_single_known_object as check_one
@@ -373,12 +342,8 @@ def check_known(settings: PipelineConfig, objects: int, split: bool) -> None:
         )
 
 
-def check_extended(settings: PipelineConfig, objects: int, split: bool) -> None:
-    """Make sure that the other options go with ``--extend``, and that the earlier run has a model.
-
-    Raises:
-        InputError: One of them does not, or it has none.
-    """
+def _check_extended(settings: PipelineConfig, objects: int, split: bool) -> None:
+    """Make sure that the other options go with --extend, and that the earlier run has a model."""
     if settings.object.extends is None:
         return
     from tracking3d.pipeline.known_object import read_known_object

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.export.options import ExportOptions
-from tracking3d.frames import Frame
+from tracking3d.frames import Frame, SkippedFrame, pixels
 from tracking3d.geometry.camera import Camera
+from tracking3d.results.checkpoint.progress import checksum
 from tracking3d.results.layout import METRE, runs_in
 from tracking3d.results.mesh_export import cut_unseen, load_model
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_reader import RunReader, places_of
 from tracking3d.results.run_unit import metres_per_unit, scale_model, scale_pose
 from tracking3d.runtime.progress import report_each
+from tracking3d.video import open_source
 from tracking3d.video.source import parse_selection
 
 FRAMES_PER_SECOND = 30.0
 """Assumed by formats that require a frame rate if it is unknown."""
+_SOURCE = argument("source=", "--source")
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +231,43 @@ class ExportedRun:
         yield from self.pinhole_pictures() if self.options.undistorted else self._read_pictures()
 
     def _read_pictures(self) -> Iterator[Frame]:
-        from tracking3d.export.pictures import read_selected_images
-
-        images = read_selected_images(self.reader, self.options.source, self.records)
+        images = _read_selected_images(self.reader, self.options.source, self.records)
         return report_each("exporting frames", images, len(self.records))
+
+
+def _read_selected_images(run: RunReader, source: str | None, wanted: Container[int]) -> Iterator[Frame]:
+    """The pictures of the ``wanted`` frames, in order, from the video where the run found it if ``source`` is None."""
+    name = source if source is not None else run.description.get("source")
+    if not isinstance(name, str) or name.isdigit():
+        raise InputError(f"The video of the run {run.folder} cannot be read again; give it as {_SOURCE}.")
+    places = places_of(name, run.folder) if source is None else []
+    name = next((str(place) for place in places if place.exists()), name)
+    try:
+        opened = open_source(name, run.description.get("selection"))
+    except InputError as error:
+        raise InputError(
+            f"The images of the run {run.folder} cannot be read: {str(error).rstrip('.')}; give the present "
+            f"path of its video as {_SOURCE}."
+        ) from error
+    first = (run.description.get("prompt") or {}).get("first_image_crc")
+    size = run.camera.height, run.camera.width
+    begun = False
+    for frame in opened:
+        if isinstance(frame, SkippedFrame) or frame.index not in wanted:
+            continue
+        if frame.size != size:
+            raise InputError(
+                f"Frame {frame.index} of {name} has {pixels(frame.size)} pixels, but frames of the run "
+                f"{run.folder} have {pixels(size)}; give the video of the run as {_SOURCE}."
+            )
+        if not begun and first is not None and checksum(frame.image) != first:
+            raise InputError(
+                f"{name} is not the video of the run {run.folder}: the image of frame {frame.index} differs; "
+                f"give the right video as {_SOURCE}."
+            )
+        begun = True
+        yield frame
+    if not begun:
+        raise InputError(
+            f"{name} has no frame of the run {run.folder}; give the video of the run as {_SOURCE}."
+        )

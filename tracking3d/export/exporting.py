@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from tracking3d.config.camera import check_object_size
 from tracking3d.config.explain import nearest
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.formats import FORMATS, Exporter
+from tracking3d.export.exporter import Exporter
+from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.layout import ARBITRARY, EXPORT, OVERWRITE, check_run_folder, partial_path, run_files
 from tracking3d.runtime.progress import report_progress

@@ -23,7 +23,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.points.bundle_adjustment.adjustment import Reversal
 from tracking3d.points.outline_fit import fit_to_outlines, outline_of
 from tracking3d.points.ray_intersection import surface_under
-from tracking3d.points.robust_bundle import bundle, other_way_round
+from tracking3d.points.robust_bundle import bundle, solve_reversed
 from tracking3d.points.view import redraw_surface
 from tracking3d.points.warping import Warps, follow_chain
 from tracking3d.runtime.progress import report_progress
@@ -228,7 +228,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
         held=_HELD * scene.radius,
     )
     found, vertices = solved(points, T_cam_obj=T), scene.vertices
-    other = other_way_round(points, T, solved, found) if scene.may_reverse else None
+    other = solve_reversed(points, T, solved, found) if scene.may_reverse else None
     if other is not None and other.is_better:
         found = other.found
         vertices = other.reversal.surface(vertices, points, found.points)

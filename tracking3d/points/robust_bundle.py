@@ -153,7 +153,7 @@ def bundle(
 
 
 @dataclass(frozen=True, eq=False)
-class OtherWayRound:
+class ReversedSolution:
     """What points and poses become with depth reversed."""
 
     reversal: Reversal  # that of points and poses
@@ -171,9 +171,9 @@ class OtherWayRound:
         return self.ratio > _HOPELESS
 
 
-def other_way_round(
+def solve_reversed(
     points: Array, T_cam_obj: Array, solved: Callable[..., BundleResult], as_it_is: BundleResult
-) -> OtherWayRound:
+) -> ReversedSolution:
     """What becomes of points and poses the other way round.
 
     Args:
@@ -185,9 +185,9 @@ def other_way_round(
     cost = max(as_it_is.cost, 1e-12)
     reversal = reversal_of(points, T_cam_obj[len(T_cam_obj) // 2])
     found = solved(reversal.points(points), T_cam_obj=reversal.poses(T_cam_obj), turns=_GLIMPSE)
-    other = OtherWayRound(reversal, found, found.cost / cost)
+    other = ReversedSolution(reversal, found, found.cost / cost)
     if other.is_hopeless:
         return other
     for _ in range(2):
         found = solved(found.points, T_cam_obj=found.T_cam_obj)
-    return OtherWayRound(reversal, found, found.cost / cost)
+    return ReversedSolution(reversal, found, found.cost / cost)

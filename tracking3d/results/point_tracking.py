@@ -88,8 +88,8 @@ class RunScene:
         rest = np.flatnonzero(~tracks.on_object & inside & (on_it | beside_object))
         if self.pictures is None or not len(rest):
             return tracks
-        points = follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
-        return with_image_points(tracks, rest, points, on_it[rest])
+        points = _follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
+        return _with_image_points(tracks, rest, points, on_it[rest])
 
     def track_in(self, other: RunScene, similarity: Similarity, frame: int, xy: ArrayLike) -> PointTracks:
         """Follow pixels of one frame through another run of the same object, with the surface of that one.
@@ -191,7 +191,7 @@ def open_scene(
             f"The video has no frame of the run {run.folder}; give the video of the run by --source."
         )
     scene = LandmarkScene([images.get(one.index) for one in run.frames], vertices, faces)
-    pictures = cache(partial(read_run_images, run, source)) if getattr(source, "repeatable", True) else None
+    pictures = cache(partial(_read_run_images, run, source)) if getattr(source, "repeatable", True) else None
     if not rounds:
         return RunScene(run, scene, pictures)
     file = run.mesh_folder / layout.LANDMARKS
@@ -315,16 +315,8 @@ class ImagePoints:
     barycentric: Array  # (N, 3) weights of its corners; NaN for points that never were
 
 
-def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
-    """The frames of a run, in the order of its records; None if there is no image.
-
-    Args:
-        run: The run.
-        source: Its frames, which it gives once more.
-
-    Raises:
-        InputError: If they cannot be read.
-    """
+def _read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
+    """The frames of a run, which ``source`` gives once more, by its records; None if there is no image."""
     indices = {one.index for one in run.frames}
     pictures = {
         frame.index: open_picture(frame.image, run.mask(frame.index))
@@ -334,7 +326,7 @@ def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]
     return [pictures.get(one.index) for one in run.frames]
 
 
-def follow_beside_mesh(
+def _follow_beside_mesh(
     run: RunReader,
     scene: LandmarkScene,
     pictures: Sequence[Picture | None],
@@ -342,16 +334,7 @@ def follow_beside_mesh(
     xy: Array,
     on_mask: NDArray[np.bool_],
 ) -> ImagePoints:
-    """Follow pixels of one frame that meet no surface there.
-
-    Args:
-        run: The run.
-        scene: Its surface in the frames.
-        pictures: The frames.
-        start: Row of the frame that the pixels are in.
-        xy: ``(N, 2)`` pixels.
-        on_mask: ``(N,)`` which of them are the object's; these are tied to its surface where they meet it.
-    """
+    """Follow pixels ``xy`` ``(N, 2)`` of row ``start`` that meet no surface there; those ``on_mask`` are tied to it."""
     tracks = follow_in_images(pictures, start, xy)
     followed, met = _by_images(tracks), np.full(len(xy), -1, np.int64)
     face, barycentric = met.copy(), np.full((len(xy), 3), np.nan)
@@ -385,17 +368,10 @@ def follow_beside_mesh(
     return ImagePoints(followed, met >= 0, face, barycentric)
 
 
-def with_image_points(
+def _with_image_points(
     tracks: PointTracks, chosen: NDArray[np.int64], points: ImagePoints, on_object: NDArray[np.bool_]
 ) -> PointTracks:
-    """Tracks with those of some points written into them.
-
-    Args:
-        tracks: Those of N points; is written to.
-        chosen: ``(M,)`` which of them.
-        points: Their state.
-        on_object: ``(M,)`` which of them lie on the object's mask.
-    """
+    """Write ``points`` into tracks, at their places ``chosen`` ``(M,)``; ``on_object`` ``(M,)`` lie on the mask."""
     found = points.followed
     for name in ("positions", "visible", "uncertainty", "measured"):
         getattr(tracks, name)[:, chosen] = getattr(found, name)

@@ -186,7 +186,7 @@ def _field_parameters(group: type) -> Iterator[inspect.Parameter]:
         option = copy(option)
         option.rich_help_panel = option.rich_help_panel or getattr(group, "PANEL", None)
         default = inspect.Parameter.empty if field.default is MISSING else field.default
-        annotation = Annotated.__class_getitem__((kind, option))  # type: ignore[attr-defined]
+        annotation = Annotated[kind, option]  # type: ignore[valid-type]
         yield inspect.Parameter(
             field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
         )

@@ -22,7 +22,7 @@ from tracking3d.estimation.segmentation import (
     as_lab,
     blend_with_initial,
     clean_mask,
-    in_question,
+    image_weight,
     log_odds,
     paste_window,
     pixel_features,
@@ -184,7 +184,7 @@ def mask_agreement(object_map: ObjectMap, camera: Camera) -> MaskAgreement:
 
 
 _DISPUTED = 0.5
-"""See `tracking3d.estimation.segmentation.in_question`: if both outlines nearly agree, as exact masks do, nothing is
+"""See `tracking3d.estimation.segmentation.image_weight`: if both outlines nearly agree, as exact masks do, nothing is
 missing that motion could add."""
 _UPSAMPLING = 2
 """Pixels of the fusion window for each pixel of the observation's window, per side."""
@@ -229,7 +229,7 @@ def fuse_mask(
     window, image, lab = upsampled_window(observation)
     own, drawn = mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
-    odds, asked = log_odds(sources), in_question(sources)
+    odds, asked = log_odds(sources), image_weight(sources)
     told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))

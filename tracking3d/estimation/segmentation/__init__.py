@@ -6,7 +6,7 @@ When all frames are known, `tracking3d.estimation.segmentation.whole_video` does
 
 from tracking3d.estimation.segmentation.colour_models import ColourModels, as_lab
 from tracking3d.estimation.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
-from tracking3d.estimation.segmentation.online_features import SOURCES, in_question, log_odds, pixel_features
+from tracking3d.estimation.segmentation.online_features import SOURCES, image_weight, log_odds, pixel_features
 from tracking3d.estimation.segmentation.pose_weight import blend_with_initial, pose_weight
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "as_lab",
     "blend_with_initial",
     "clean_mask",
-    "in_question",
+    "image_weight",
     "log_odds",
     "paste_window",
     "pixel_features",

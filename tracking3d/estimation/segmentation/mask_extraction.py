@@ -28,7 +28,7 @@ def snap_to_edges(
     Args:
         image: ``(S, S, 3)`` RGB.
         log_odds: ``(S, S)``.
-        share: How far the image has to be asked, see `tracking3d.estimation.segmentation.in_question`.
+        share: How far the image has to be asked, see `tracking3d.estimation.segmentation.image_weight`.
     """
     support = np.tanh(log_odds / 2).astype(np.float32)
     if why_no_contrib(SMOOTHER):

@@ -65,7 +65,7 @@ def pixel_features(
     return np.stack([*shapes, asked * nearby, asked * remembered], -1).astype(np.float32)
 
 
-def in_question(features: NDArray[np.float32]) -> float:
+def image_weight(features: NDArray[np.float32]) -> float:
     """How far the image has to be asked, in [0, 1]: little where both outlines agree, for they are more exact then."""
     return _query_share(features[..., _INITIAL], features[..., _RENDERED])
 

@@ -332,7 +332,7 @@ class Viewer:
             self._panel.here.value = self._panel.path.value = False
             T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
             camera = record.through(self._runs[0].camera)
-            look_through(self._server, T_world_cam, camera.fov, camera.width / camera.height)
+            _look_through(self._server, T_world_cam, camera.fov, camera.width / camera.height)
 
 
 def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
@@ -365,17 +365,10 @@ def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene], na
     camera.fov = first_look.FOV
 
 
-def look_through(
+def _look_through(
     server: viser.ViserServer, T_world_cam: NDArray[np.floating], fov: float, aspect: float
 ) -> None:
-    """Move every browser's view to a camera, with its whole field of view.
-
-    Args:
-        server: Serves the browsers.
-        T_world_cam: ``(4, 4)`` from the camera to the scene.
-        fov: Its vertical field of view in degrees.
-        aspect: Width of its picture through its height.
-    """
+    """Move every browser's view to a camera of an ``aspect`` and a vertical ``fov`` in degrees, so that all is seen."""
     rotation = viser.transforms.SO3.from_matrix(T_world_cam[:3, :3])
     for client in server.get_clients().values():
         with client.atomic():
