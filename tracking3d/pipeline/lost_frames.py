@@ -16,6 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,11 +24,13 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.initialization.start_window import score_starts
 from tracking3d.estimation.solver import Gap, PhotoSet
-from tracking3d.frames import TRACKED_CONFIDENCE, Frame, MaskEstimate
+from tracking3d.frames import TRACKED_CONFIDENCE, Box, Frame, MaskEstimate
 from tracking3d.pipeline.frame_reading import SavedMasks, read_again, read_timed
 from tracking3d.pipeline.session import Session
 from tracking3d.results.description import StartOfModel
 from tracking3d.runtime.progress import report_each, report_progress
+from tracking3d.trackers.crops import box_of
+from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.video.both_ways import backwards, both_ways
 from tracking3d.video.source import FrameSource
 
@@ -36,6 +39,9 @@ _log = logging.getLogger(__name__)
 _MIN_LOST = 0.05  # share of the frames from which something is done
 _MIN_TRACKED = 0.5  # share of a photo set below which its start is doubted
 _MIN_PHOTOS = 4  # photos with a mask
+# Whether the camera stands still: pixels along the longer side of the pictures that are compared, margin around the
+# object as a share of its box, grey levels by which they differ at most in the mean (measured: .1 and 4 where it does).
+_COMPARED, _MARGIN, _STILL = 160, 0.1, 8.0
 T = TypeVar("T")
 
 
@@ -127,14 +133,16 @@ def start_from_photos(
         Where the model started, None if it stays; and which photos are not joined, in words.
     """
     causal = masks.estimates.causal
+    is_set = source.fps is None and not session.config.has_given_masks
+    own = PhotoMasks(source, masks) if is_set else None
 
     def read(indices: Collection[int]) -> Iterator[tuple[Frame, MaskEstimate]]:
         wanted = frozenset(indices)
         frames = (frame for frame in read_again(source) if frame.index in wanted)
-        return masks.with_masks(frames)
+        return masks.with_masks(frames) if own is None else ((frame, own.of(frame)) for frame in frames)
 
     report_progress("joining photos")
-    seen = tuple(sorted(index for index in causal if masks.has_mask(index)))
+    seen = tuple(sorted(index for index in causal if masks.has_mask(index) or (own and own.one_box)))
     attempt, advice = session.start_from_photos(PhotoSet(seen, read))
     if attempt is None:  # nothing but matches, which hardly cost anything, was tried
         return None, advice
@@ -145,8 +153,73 @@ def start_from_photos(
     if explained <= before:
         return None, ""
     session.adopt(attempt)
+    for frame, mask in read(seen) if own is not None else ():
+        masks.estimates.put_initial_mask(frame.index, mask)
     reason = f"frames joined as photos explain {explained} of {len(causal)}, those before {before}"
     return StartOfModel(min(attempt.poses), reason, advice), advice
+
+
+class PhotoMasks:
+    """Masks of photos, each segmented by itself: through wide steps none can be carried.
+
+    A photo's box is that of its initial mask. Where the camera stands still it is one for all: a mask that has lost a
+    side of a thing which turns has lost it in some photos only.
+
+    Args:
+        source: The photos.
+        masks: Their initial masks.
+
+    Attributes:
+        one_box: Whether all photos have the same.
+    """
+
+    def __init__(self, source: FrameSource, masks: SavedMasks) -> None:
+        from tracking3d.trackers.segment.network import ObjectNetwork  # slow to import
+
+        found = ((index, masks.estimates.initial_mask(index)) for index in masks.estimates.causal)
+        boxes = {index: None if mask is None else box_of(mask) for index, mask in found}
+        self._boxes: dict[int, Box] = {index: box for index, box in boxes.items() if box is not None}
+        self._masks, self._network = masks, ObjectNetwork()
+        self.one_box = False
+        if self._boxes:
+            x, y, width, height = np.array(list(self._boxes.values())).T
+            left, top = float(x.min()), float(y.min())
+            around = left, top, float((x + width).max()) - left, float((y + height).max()) - top
+            self.one_box = _stands_still(source, around)
+            if self.one_box:
+                self._boxes = dict.fromkeys(boxes, around)
+
+    def of(self, frame: Frame) -> MaskEstimate:
+        """The mask of a photo; the initial one if the user has given it, or nothing was seen."""
+        before, box = self._masks.of(frame), self._boxes.get(frame.index)
+        if box is None or self._masks.estimates.is_given(frame.index):
+            return before
+        likely, hidden = self._network.segment_box(frame.image, box)
+        mask = mask_with_network(frame.image, box, likely)
+        return replace(before, mask=mask, occluder=(hidden > 0.5) & (mask < 0.5))
+
+
+def _stands_still(source: FrameSource, around: Box) -> bool:
+    """Whether pictures are alike outside a box ``(x, y, w, h)`` and a margin around it."""
+    pictures = list[NDArray[np.float32]]()
+    beside: NDArray[np.bool_] | None = None
+    for frame in read_again(source):
+        image = grey(frame.image)
+        scale = _COMPARED / max(image.shape)
+        size = [max(round(scale * length), 1) for length in image.shape]
+        pictures.append(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA).astype(np.float32))
+        if beside is None:
+            beside = np.ones(size, bool)
+            margin = _MARGIN * max(around[2:])
+            rows, columns = (
+                slice(max(round(scale * (at - margin)), 0), max(round(scale * (at + length + margin)), 0))
+                for at, length in ((around[1], around[3]), (around[0], around[2]))
+            )
+            beside[rows, columns] = False
+    if beside is None or not beside.any():
+        return False
+    seen = np.stack([picture[beside] for picture in pictures])
+    return float(np.abs(seen - np.median(seen, axis=0)).mean()) < _STILL
 
 
 # A second start: if what began with the first frame explains too little of a video, another window may explain more.

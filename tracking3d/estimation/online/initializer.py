@@ -215,11 +215,15 @@ class Initializer:
 
     def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
+        from tracking3d.features.keypoint_network import NetworkDetector  # slow to import
+
         observer, camera = self.observer, self.observer.camera
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        found, waiting, strengths = list[Photo](), list[Pending](), list[float]()
+        detectors = (observer.detector, NetworkDetector(NetworkDetector.Options()))
+        kinds: tuple[list[Photo], ...] = tuple([] for _ in detectors)
+        waiting, strengths = list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):
             frame, binary = mask.on(frame), mask.found
             if binary is None:
@@ -231,17 +235,18 @@ class Initializer:
             pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=observer.device))
             view = view_frame(observer, begun, frame, binary, pose, FollowedPoints.none())
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
-            found.append(Photo.of(frame.index, grey(frame.image), binary, observer.detector))
+            for found, detector in zip(kinds, detectors, strict=True):
+                found.append(Photo.of(frame.index, grey(frame.image), binary, detector))
             strengths.append(texture_strength(grey(frame.image), binary))
-        start = start_of_photos(found, camera)
+        start = start_of_photos(kinds, camera)
         if begun is None or start.structure is None:
-            reason = start.reason if has_texture(strengths) or not found else _PLAIN
+            reason = start.reason if has_texture(strengths) or not waiting else _PLAIN
             if isinstance(state, Initializing):
                 state = replace(state, waiting_reason=reason)
             return state, PhotoEstimates((), reason)
         weights = FitWeights(smoothness=self.options.smoothness)
         views = [view for view, _ in waiting]
-        made, shown = initial_map_of_photos(begun.object_map, start, found, views, camera, weights)
+        made, shown = initial_map_of_photos(begun.object_map, start, kinds[0], views, camera, weights)
         pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
         joined, last = self._make_map(replace(begun, pending=pending), made)
         estimates = [*last.revised, replace(last, revised=())]
