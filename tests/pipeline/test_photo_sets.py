@@ -15,11 +15,15 @@ from resumable_runs import Stopped, assert_alike, settings, stop_at
 from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.solver import PhotoEstimates
+from tracking3d.frames import MaskEstimate
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
-from tracking3d.results.files import write_image
+from tracking3d.results import layout
+from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.refined_estimates import RefinedEstimates
+from tracking3d.results.refinement_writer import clear_refinement
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
@@ -129,6 +133,63 @@ def test_photos_that_are_not_joined_leave_the_other_tries_their_frames():
     tried = lost_frames.TriedFrames(8, Counter())
     assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "take more")
     assert tried.left == 8
+
+
+def photo_masks(folder, masks, given=()):
+    """The masks of photos, each by itself, after a mask tracker has given ``masks``."""
+    source = open_source(str(folder))
+    estimates = SimpleNamespace(
+        causal=dict.fromkeys(range(len(masks))),
+        initial_mask=lambda index: masks[index],
+        is_given=lambda index: index in given,
+    )
+
+    def of(frame):
+        mask = masks[frame.index]
+        return MaskEstimate(None if mask is None else mask.astype(np.float32))
+
+    before = SimpleNamespace(estimates=estimates, of=of)
+    return lost_frames.PhotoMasks(source, before), list(source)
+
+
+def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos):
+    folder, _ = photos
+    masks = list(turntable().masks.copy())
+    masks[3][:, 160:] = False  # the mask tracker has lost one side,
+    masks[4] = None  # and then everything
+    own, frames = photo_masks(folder, masks, given={5})
+    assert own.one_box
+    for index in (3, 4):
+        assert mask_iou_or_none(own.of(frames[index]).found, turntable().masks[index]) > 0.9
+    assert np.array_equal(own.of(frames[5]).found, masks[5])  # the user knows better
+
+
+def test_where_the_camera_moves_each_photo_keeps_its_box(photos, tmp_path):
+    folder, _ = photos
+    for index, image in enumerate(turntable().images):  # two halves of the room
+        other = np.where(turntable().masks[index][..., None], image, np.uint8(40 + 160 * (index % 2)))
+        write_image(folder / f"{index:03d}.png", other)
+    masks = list(turntable().masks.copy())
+    masks[4] = None
+    own, frames = photo_masks(folder, masks)
+    assert not own.one_box
+    assert mask_iou_or_none(own.of(frames[3]).found, masks[3]) > 0.9
+    assert own.of(frames[4]).found is None
+
+
+def test_the_mask_trackers_masks_stay_beside_those_of_photos(tmp_path):
+    (tmp_path / layout.INITIAL_MASKS).mkdir()
+    (tmp_path / layout.REFINING).mkdir()
+    tracked, own = np.zeros((2, 4, 6), bool)
+    tracked[1:3, 1:3] = own[1:4, 1:5] = True
+    write_mask(layout.initial_mask_path(tmp_path, 0), tracked)
+    estimates = RefinedEstimates(tmp_path, (), (4, 6))
+    estimates.put_initial_mask(0, MaskEstimate(own.astype(np.float32), occluder=~own))
+    assert np.array_equal(estimates.initial_mask(0), own)
+    assert np.array_equal(estimates.occluder(0), ~own)
+    clear_refinement(tmp_path)
+    assert np.array_equal(estimates.initial_mask(0), tracked)
+    assert not (tmp_path / layout.REFINING).exists()
 
 
 def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():

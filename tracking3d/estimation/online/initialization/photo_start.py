@@ -79,7 +79,8 @@ _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and
 _FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.95
 _LEAST_JOINED = 0.4  # share of the photos that is joined at least (chosen)
 _MOST_JOINED = 0.9  # share of the photos from which no other pairing or keypoints are tried (chosen)
-_ALIKE = 3.0  # degrees between the turns of two structures that confirm each other (chosen)
+# Degrees between the turns of two structures that confirm each other, and in which share of their photos (chosen)
+_ALIKE, _ALIKE_SHARE = 3.0, 0.9
 _MANY_SHARED = 25  # matches of neighbours, at the median, from which it is not points that lack (chosen)
 # The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
 # points from their middle, share of the photos that must show a cell inside, and cells that a cell covers in a photo
@@ -473,7 +474,7 @@ def start_of_photos(kinds: Sequence[Sequence[Photo]], camera: Camera) -> PhotoSt
         tracks = PhotoTracks(join_tracks(photos, matches[kind]), threshold, camera.assumed)
         tried += [(kind, tracks, *_upright(tracks, one)) for one in solve_photos(tracks, cameras)]
         for of, its_tracks, one, evidence in tried:
-            confirmed = any(_agree(one, other) for other_kind, _, other, _ in tried if other_kind != of)
+            confirmed = any(agree(one, other) for other_kind, _, other, _ in tried if other_kind != of)
             if (best is None or len(one.photos) > len(best.joined)) and is_reliable(
                 photos, one, evidence, confirmed
             ):
@@ -484,14 +485,14 @@ def start_of_photos(kinds: Sequence[Sequence[Photo]], camera: Camera) -> PhotoSt
     return replace(best, reason=_why_not_joined(kinds[0], matches, best.joined))
 
 
-def _agree(one: PhotoStructure, other: PhotoStructure) -> bool:
+def agree(one: PhotoStructure, other: PhotoStructure) -> bool:
     """Whether two structures, of keypoints of two kinds, turn their common photos alike."""
     common = sorted({*one.photos} & {*other.photos})
     if len(common) < _FEWEST_PHOTOS:
         return False
     turns = Rotation.from_matrix(one.R[common].transpose(0, 2, 1) @ other.R[common])
     apart = (turns.mean().inv() * turns).magnitude()
-    return bool(np.degrees(apart.max()) < _ALIKE)
+    return bool(np.degrees(np.quantile(apart, _ALIKE_SHARE)) < _ALIKE)
 
 
 def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure, float]:
