@@ -89,6 +89,15 @@ def test_where_one_kind_of_keypoints_joins_too_few_another_does():
     assert errors(start.structure, turntable()).max() < 3
 
 
+def test_further_keypoints_that_join_some_photos_only_are_not_believed_alone():
+    nothing = (Keypoints.none(),)
+    none = [replace(photo, keypoints=nothing) for photo in photos_of()]
+    some = [photo if place < 6 else none[place] for place, photo in enumerate(photos_of())]
+    first = start_of_photos([some, none], turntable().camera)
+    assert first.structure is not None and not first.joined & {6, 7}
+    assert start_of_photos([none, some], turntable().camera).structure is None
+
+
 def test_photos_in_any_order_are_joined_by_all_their_pairs():
     order = np.random.default_rng(0).permutation(8)
     shuffled = [replace(photos_of()[place], index=number) for number, place in enumerate(order)]
