@@ -199,7 +199,13 @@ def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
     run = {"source_notes": [], "camera": camera, "refinement": {"start": {"advice": advice}}}
     unseen = SimpleNamespace()  # a model that would be asked for what was never seen
     assert notes_of_run(run, unseen, []) == [advice]
-    bottle = cast(FrameRecord, SimpleNamespace(free_axis=(0.0, 1.0, 0.0)))
+    photos = [
+        cast(FrameRecord, SimpleNamespace(free_axis=None, status=status, time=None))
+        for status in (Status.TRACKED, Status.UNCERTAIN)
+    ]
+    assert advice in notes_of_run(run, None, photos)
+    assert advice not in notes_of_run(run, None, photos[:1])  # found by the model of the others
+    bottle = cast(FrameRecord, SimpleNamespace(free_axis=(0.0, 1.0, 0.0), status=Status.UNCERTAIN))
     assert advice not in notes_of_run(run, None, [bottle]) and FREE_ROTATION in notes_of_run(
         run, None, [bottle]
     )
