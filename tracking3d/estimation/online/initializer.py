@@ -24,7 +24,7 @@ from tracking3d.estimation.online.features.klt import (
     has_texture,
     texture_strength,
 )
-from tracking3d.estimation.online.features.sift import Detector
+from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     restart_without_points,
@@ -237,7 +237,9 @@ class Initializer:
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        detectors = (observer.detector, NetworkDetector(NetworkDetector.Options()))
+        is_network = isinstance(observer.detector, NetworkDetector)
+        other: Detector = SIFT if is_network else NetworkDetector(NetworkDetector.Options())
+        detectors = observer.detector, other
         kinds: tuple[list[Photo], ...] = tuple([] for _ in detectors)
         waiting, strengths = list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):

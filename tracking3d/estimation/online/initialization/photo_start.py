@@ -4,7 +4,8 @@ Points that are followed from frame to frame do not last through steps of 10 deg
 turntable. Keypoints that are matched do. Two photos do not tell the turn between them while the lens is not known;
 three do (`structure_hypotheses`, under several lenses). To these the others are added one by one, each by the pose of
 the points that it shares (PnP), and all is adjusted together with the focal length (Snavely et al., "Photo tourism",
-2006). Several pairings of the photos compete, since an object may look alike from two sides.
+2006). Several pairings of the photos compete, since an object may look alike from two sides, and two kinds of
+keypoints.
 
 Whether the outcome is reliable is told by what was not fitted: the same outlines carved from all photos must fill the
 mask of each, a photo must show points that face it, and the reversal in depth must fit clearly worse.
@@ -453,7 +454,7 @@ def start_of_photos(kinds: Sequence[Sequence[Photo]], camera: Camera) -> PhotoSt
 
     Args:
         kinds: The photos, in the order in which they were most likely taken, at most `MOST_PHOTOS`; once for each kind
-            of keypoints, the most precise first.
+            of keypoints.
         camera: The camera of all; if its focal length is assumed, others are tried and the best is found.
     """
     count = len(kinds[0])
