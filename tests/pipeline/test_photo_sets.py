@@ -27,6 +27,7 @@ from tracking3d.results.refinement_writer import clear_refinement
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
+from tracking3d.video.source import FrameSource
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 
@@ -93,6 +94,7 @@ def needs(statuses: list[Status], fps: float | None, lacks_points: bool) -> bool
     return lost_frames.needs_photo_start(session, SimpleNamespace(fps=fps), masks)
 
 
+VIDEO = cast(FrameSource, SimpleNamespace(fps=30.0))  # its masks stay as they are
 GOOD, BAD = [Status.TRACKED] * 8, [Status.UNCERTAIN] * 5 + [Status.TRACKED] * 3
 
 
@@ -122,7 +124,7 @@ def test_a_start_that_explains_no_more_than_there_is_stays_out():
         start_from_photos=lambda photos: (attempt, ""), adopt=lambda attempt: pytest.fail("no better")
     )
     tried = lost_frames.TriedFrames(8, Counter())
-    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "")
+    assert lost_frames.start_from_photos(session, VIDEO, masks, tried) == (None, "")
     assert tried.left == 0
 
 
@@ -131,7 +133,7 @@ def test_photos_that_are_not_joined_leave_the_other_tries_their_frames():
     masks = SimpleNamespace(estimates=SimpleNamespace(causal=causal), has_mask=lambda index: True)
     session = SimpleNamespace(start_from_photos=lambda photos: (None, "take more"))
     tried = lost_frames.TriedFrames(8, Counter())
-    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "take more")
+    assert lost_frames.start_from_photos(session, VIDEO, masks, tried) == (None, "take more")
     assert tried.left == 8
 
 
@@ -162,6 +164,8 @@ def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos):
     for index in (3, 4):
         assert mask_iou_or_none(own.of(frames[index]).found, turntable().masks[index]) > 0.9
     assert np.array_equal(own.of(frames[5]).found, masks[5])  # the user knows better
+    own, frames = photo_masks(folder, list(turntable().masks))  # nothing was lost, and masks stay as they are
+    assert own.box is None and np.array_equal(own.of(frames[3]).found, turntable().masks[3])
 
 
 def test_where_the_camera_or_the_object_moves_photos_keep_the_mask_trackers_masks(photos):
