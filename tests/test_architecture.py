@@ -34,13 +34,13 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14200,  # kernels of the joint fit; carried masks; restarts for live sources
+    "estimation": 14250,  # kernels of the joint fit; carried masks; restarts for live sources; two kinds of keypoints
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
     "geometry": 2100,  # poses keep their matrices; the loop of Levenberg and Marquardt
     "modules": 450,
-    "pipeline": 6900,  # what is tried when frames are lost; shapes get the memory of what tracked; carried masks
+    "pipeline": 6950,  # what is tried when frames are lost; carried masks; photos are segmented by themselves
     "plugins": 850,  # the group of keypoint detectors
     "points": 3650,  # the fit of one pose in a kernel
     "reconstruction": 3900,  # total variation in a kernel

@@ -15,14 +15,19 @@ from resumable_runs import Stopped, assert_alike, settings, stop_at
 from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.solver import PhotoEstimates
+from tracking3d.frames import MaskEstimate
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
-from tracking3d.results.files import write_image
+from tracking3d.results import layout
+from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.refined_estimates import RefinedEstimates
+from tracking3d.results.refinement_writer import clear_refinement
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
+from tracking3d.video.source import FrameSource
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
 
@@ -89,6 +94,7 @@ def needs(statuses: list[Status], fps: float | None, lacks_points: bool) -> bool
     return lost_frames.needs_photo_start(session, SimpleNamespace(fps=fps), masks)
 
 
+VIDEO = cast(FrameSource, SimpleNamespace(fps=30.0))  # its masks stay as they are
 GOOD, BAD = [Status.TRACKED] * 8, [Status.UNCERTAIN] * 5 + [Status.TRACKED] * 3
 
 
@@ -118,7 +124,7 @@ def test_a_start_that_explains_no_more_than_there_is_stays_out():
         start_from_photos=lambda photos: (attempt, ""), adopt=lambda attempt: pytest.fail("no better")
     )
     tried = lost_frames.TriedFrames(8, Counter())
-    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "")
+    assert lost_frames.start_from_photos(session, VIDEO, masks, tried) == (None, "")
     assert tried.left == 0
 
 
@@ -127,8 +133,68 @@ def test_photos_that_are_not_joined_leave_the_other_tries_their_frames():
     masks = SimpleNamespace(estimates=SimpleNamespace(causal=causal), has_mask=lambda index: True)
     session = SimpleNamespace(start_from_photos=lambda photos: (None, "take more"))
     tried = lost_frames.TriedFrames(8, Counter())
-    assert lost_frames.start_from_photos(session, None, masks, tried) == (None, "take more")
+    assert lost_frames.start_from_photos(session, VIDEO, masks, tried) == (None, "take more")
     assert tried.left == 8
+
+
+def photo_masks(folder, masks, given=()):
+    """The masks of photos, each by itself, after a mask tracker has given ``masks``."""
+    source = open_source(str(folder))
+    estimates = SimpleNamespace(
+        causal=dict.fromkeys(range(len(masks))),
+        initial_mask=lambda index: masks[index],
+        is_given=lambda index: index in given,
+    )
+
+    def of(frame):
+        mask = masks[frame.index]
+        return MaskEstimate(None if mask is None else mask.astype(np.float32))
+
+    before = SimpleNamespace(estimates=estimates, of=of)
+    return lost_frames.PhotoMasks(source, before), list(source)
+
+
+def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos):
+    folder, _ = photos
+    masks = list(turntable().masks.copy())
+    masks[3][:, 160:] = False  # the mask tracker has lost one side,
+    masks[4] = None  # and then everything
+    own, frames = photo_masks(folder, masks, given={5})
+    assert own.box is not None
+    for index in (3, 4):
+        assert mask_iou_or_none(own.of(frames[index]).found, turntable().masks[index]) > 0.9
+    assert np.array_equal(own.of(frames[5]).found, masks[5])  # the user knows better
+    own, frames = photo_masks(folder, list(turntable().masks))  # nothing was lost, and masks stay as they are
+    assert own.box is None and np.array_equal(own.of(frames[3]).found, turntable().masks[3])
+
+
+def test_where_the_camera_or_the_object_moves_photos_keep_the_mask_trackers_masks(photos):
+    folder, _ = photos
+    masks = list(turntable().masks)
+    far = [*masks[:-1], np.roll(masks[-1], 120, axis=1)]  # what strays makes the box of all too loose
+    own, frames = photo_masks(folder, far)
+    assert own.box is None and np.array_equal(own.of(frames[-1]).found, far[-1])
+    room = np.random.default_rng(0).integers(0, 255, (240, 640, 3), np.uint8)
+    for index, image in enumerate(turntable().images):
+        wall = room[:, 40 * index : 40 * index + 320]
+        write_image(folder / f"{index:03d}.png", np.where(masks[index][..., None], image, wall))
+    own, frames = photo_masks(folder, masks)
+    assert own.box is None and np.array_equal(own.of(frames[3]).found, masks[3])
+
+
+def test_the_mask_trackers_masks_stay_beside_those_of_photos(tmp_path):
+    (tmp_path / layout.INITIAL_MASKS).mkdir()
+    (tmp_path / layout.REFINING).mkdir()
+    tracked, own = np.zeros((2, 4, 6), bool)
+    tracked[1:3, 1:3] = own[1:4, 1:5] = True
+    write_mask(layout.initial_mask_path(tmp_path, 0), tracked)
+    estimates = RefinedEstimates(tmp_path, (), (4, 6))
+    estimates.put_initial_mask(0, MaskEstimate(own.astype(np.float32), occluder=~own))
+    assert np.array_equal(estimates.initial_mask(0), own)
+    assert np.array_equal(estimates.occluder(0), ~own)
+    clear_refinement(tmp_path)
+    assert np.array_equal(estimates.initial_mask(0), tracked)
+    assert not (tmp_path / layout.REFINING).exists()
 
 
 def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
@@ -137,7 +203,13 @@ def test_advice_on_photos_is_a_note_and_nobody_is_asked_to_film_other_sides():
     run = {"source_notes": [], "camera": camera, "refinement": {"start": {"advice": advice}}}
     unseen = SimpleNamespace()  # a model that would be asked for what was never seen
     assert notes_of_run(run, unseen, []) == [advice]
-    bottle = cast(FrameRecord, SimpleNamespace(free_axis=(0.0, 1.0, 0.0)))
+    photos = [
+        cast(FrameRecord, SimpleNamespace(free_axis=None, status=status, time=None))
+        for status in (Status.TRACKED, Status.UNCERTAIN)
+    ]
+    assert advice in notes_of_run(run, None, photos)
+    assert advice not in notes_of_run(run, None, photos[:1])  # found by the model of the others
+    bottle = cast(FrameRecord, SimpleNamespace(free_axis=(0.0, 1.0, 0.0), status=Status.UNCERTAIN))
     assert advice not in notes_of_run(run, None, [bottle]) and FREE_ROTATION in notes_of_run(
         run, None, [bottle]
     )

@@ -118,7 +118,7 @@ def mask_path(folder: Path, index: int) -> Path:
 
 
 def initial_mask_path(folder: Path, index: int) -> Path:
-    """Path of the mask tracker's mask of frame ``index``."""
+    """Path of the mask tracker's mask of frame ``index``; in `REFINING`, of a photo's own."""
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
@@ -204,6 +204,7 @@ def run_files(folder: Path) -> list[Path]:
         folder / PROMPTS,
         folder / CAUSAL / MASKS,
         folder / REFINING / MASKS,
+        folder / REFINING / INITIAL_MASKS,
     ):
         if masks.is_dir():
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
@@ -215,7 +216,8 @@ def run_folders(folder: Path) -> list[Path]:
     """The folders within a run folder, whether they are there or not; outer ones first."""
     masks = (MASKS, VISIBLE_MASKS, INITIAL_MASKS, PROBABILITIES, PROMPTS)
     inner = (CAUSAL, ONLINE, REFINING, STATE, CORRECTING, PARTS, *masks)
-    within = ((CAUSAL, MASKS), (REFINING, MASKS), (REFINING, PROBABILITIES), (STATE, MASKS))
+    aside = tuple((REFINING, name) for name in (MASKS, INITIAL_MASKS, PROBABILITIES))
+    within = ((CAUSAL, MASKS), *aside, (STATE, MASKS))
     return [folder / name for name in inner] + [folder / outer / name for outer, name in within]
 
 

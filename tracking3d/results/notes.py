@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tracking3d.estimation.estimate import FREE_ROTATION, ObjectModel
+from tracking3d.estimation.estimate import FREE_ROTATION, ObjectModel, Status
 from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.results.records import FrameRecord
 
@@ -35,7 +35,9 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
     counted = (run.get("prompt") or {}).get("frames") is not None
     revolved = any(one.free_axis for one in records)
-    advice = "" if revolved else advice_on_photos(run)  # it is tracked without points that could join photos
+    tracked = bool(records) and all(one.status is Status.TRACKED for one in records)
+    # Photos that were not joined may be found by the model of the others, or without points.
+    advice = "" if revolved or tracked else advice_on_photos(run)
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource
-from tracking3d.frames import Frame
+from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results import layout
 from tracking3d.results.files import (
     decode_mask,
@@ -72,12 +72,31 @@ class RefinedEstimates:
         return np.zeros(self._size, bool) if mask is None else mask
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
-        """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""
-        return read_mask(layout.initial_mask_path(self._folder, index))
+        """The mask of frame ``index`` by the mask tracker, or of a photo by itself, ``(H, W)`` bool, or None."""
+        return read_mask(layout.initial_mask_path(self._with_initial_mask(index), index))
 
     def occluder(self, index: int) -> NDArray[np.bool_] | None:
-        """What is in front of the object, by the mask tracker, in frame ``index``, ``(H, W)`` bool, or None."""
-        return read_occluder(self._folder, index)
+        """What is in front of the object in frame ``index``, beside `initial_mask`, ``(H, W)`` bool, or None."""
+        return read_occluder(self._with_initial_mask(index), index)
+
+    def _with_initial_mask(self, index: int) -> Path:
+        own = layout.initial_mask_path(self._aside, index).is_file()
+        return self._aside if own else self._folder
+
+    def is_given(self, index: int) -> bool:
+        """Whether the user has given the mask of frame ``index``."""
+        return layout.prompt_path(self._folder, index).is_file()
+
+    def put_initial_mask(self, index: int, estimate: MaskEstimate) -> None:
+        """Take another initial mask of frame ``index`` in the refinement; the mask tracker's stays in the folder.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        path, mask = layout.initial_mask_path(self._aside, index), estimate.found
+        with writing(path):
+            path.parent.mkdir(exist_ok=True)
+        write_mask(path, np.zeros(self._size, bool) if mask is None else mask, estimate.occluder)
 
     def visible(self, index: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """What is seen of the object, ``(H, W)``: its mask in frame ``index`` without what is in front of it."""

@@ -263,7 +263,7 @@ def undo_taking_over(folder: Path) -> None:
 
 def _remove_folders(folder: Path) -> None:
     """Remove the emptied folder and its folders of masks."""
-    for inner in (layout.MASKS, layout.PROBABILITIES):
+    for inner in (layout.MASKS, layout.INITIAL_MASKS, layout.PROBABILITIES):
         with suppress(FileNotFoundError):
             (folder / inner).rmdir()
     folder.rmdir()

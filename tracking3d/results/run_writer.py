@@ -214,6 +214,7 @@ class RunWriter:
         self._pictures.close()
         if model is not None:
             export_mesh(self.folder, model)
+            clear_refinement(self.folder)  # of a run that was stopped before anything was refined
         else:
             with writing(self.folder):
                 self._lines.truncate()

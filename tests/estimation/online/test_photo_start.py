@@ -18,6 +18,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
     PhotoStructure,
     PhotoTracks,
     add_photo,
+    agree,
     facing,
     is_reliable,
     keep_connected,
@@ -74,17 +75,33 @@ def errors(found: PhotoStructure, clip: SyntheticClip, places=None) -> np.ndarra
 
 
 def test_photos_twenty_degrees_apart_are_joined_and_right():
-    start = start_of_photos(photos_of(), turntable().camera)
+    start = start_of_photos([photos_of()], turntable().camera)
     assert start.structure is not None
     assert len(start.structure.photos) == 8
     assert start.reason == ""
     assert errors(start.structure, turntable()).max() < 3
 
 
+def test_where_one_kind_of_keypoints_joins_too_few_another_does():
+    none = [replace(photo, keypoints=(Keypoints.none(),)) for photo in photos_of()]
+    start = start_of_photos([none, photos_of()], turntable().camera)
+    assert start.joined == set(range(8))
+    assert errors(start.structure, turntable()).max() < 3
+
+
+def test_further_keypoints_that_join_some_photos_only_are_not_believed_alone():
+    nothing = (Keypoints.none(),)
+    none = [replace(photo, keypoints=nothing) for photo in photos_of()]
+    some = [photo if place < 6 else none[place] for place, photo in enumerate(photos_of())]
+    first = start_of_photos([some, none], turntable().camera)
+    assert first.structure is not None and not first.joined & {6, 7}
+    assert start_of_photos([none, some], turntable().camera).structure is None
+
+
 def test_photos_in_any_order_are_joined_by_all_their_pairs():
     order = np.random.default_rng(0).permutation(8)
     shuffled = [replace(photos_of()[place], index=number) for number, place in enumerate(order)]
-    start = start_of_photos(shuffled, turntable().camera)
+    start = start_of_photos([shuffled], turntable().camera)
     assert start.structure is not None
     assert len(start.structure.photos) == 8
     assert errors(start.structure, turntable(), order).max() < 3
@@ -105,7 +122,7 @@ def test_a_thing_that_is_turned_over_between_photos_is_one_solid(monkeypatch):
     clip = turntable.__wrapped__(12, 25.0)
     seen = zip(clip.images, clip.masks, strict=True)
     start = start_of_photos(
-        [Photo.of(n, grey(image), mask) for n, (image, mask) in enumerate(seen)], clip.camera
+        [[Photo.of(n, grey(image), mask) for n, (image, mask) in enumerate(seen)]], clip.camera
     )
     assert start.structure is not None
     assert len(start.structure.photos) == 12 and start.reason == ""
@@ -115,7 +132,7 @@ def test_a_thing_that_is_turned_over_between_photos_is_one_solid(monkeypatch):
 @pytest.mark.slow
 def test_the_lens_need_not_be_known():
     assumed = replace(turntable().camera, assumed=True).zoom(0.6, "a guess")
-    start = start_of_photos(photos_of(), assumed)
+    start = start_of_photos([photos_of()], assumed)
     assert start.structure is not None
     assert errors(start.structure, turntable()).max() < 3
     assert start.structure.K[0, 0] == pytest.approx(turntable().camera.fx, rel=0.1)
@@ -125,7 +142,7 @@ def test_a_photo_that_shows_too_little_is_named_with_its_neighbours():
     photos = list(photos_of())
     nothing = tuple(Keypoints.none() for _ in photos[4].keypoints)
     photos[4] = replace(photos[4], keypoints=nothing)
-    start = start_of_photos(photos, turntable().camera)
+    start = start_of_photos([photos], turntable().camera)
     assert start.structure is not None
     assert 4 not in start.structure.photos
     assert start.reason.endswith("take one every 20 degrees or less")
@@ -158,7 +175,7 @@ def test_what_is_known_to_be_plain_is_not_looked_at_as_photos():
 
 
 def test_photos_too_far_apart_are_not_joined_and_no_motion_is_asked_for():
-    start = start_of_photos(photos_of(6, 60.0), turntable(6, 60.0).camera)
+    start = start_of_photos([photos_of(6, 60.0)], turntable(6, 60.0).camera)
     assert start.structure is None
     assert start.reason.startswith("6 photos, none joined; photo ")
     assert "take one every 20 degrees or less" in start.reason
@@ -167,7 +184,7 @@ def test_photos_too_far_apart_are_not_joined_and_no_motion_is_asked_for():
 
 def test_points_that_do_not_move_as_one_solid_are_called_reflections(monkeypatch):
     monkeypatch.setattr(photo_start, "solve_photos", lambda tracks, cameras: [])
-    start = start_of_photos(photos_of(), turntable().camera)
+    start = start_of_photos([photos_of()], turntable().camera)
     assert start.structure is None
     assert start.reason == "8 photos, none joined; points on it do not move as one solid (reflections?)"
 
@@ -335,3 +352,15 @@ def test_too_few_photos_points_that_fit_badly_and_a_possible_reversal_are_not_re
 ):
     _, truth, photos = full_turn()
     assert is_reliable(photos, replace(truth, **change), evidence) is reliable
+
+
+def test_other_keypoints_that_turn_alike_excuse_points_that_fit_badly():
+    _, truth, photos = full_turn()
+    turns = Rotation.from_rotvec(np.radians(30.0) * np.outer(np.arange(12), [0, -1, 0])).as_matrix()
+    R = truth.R @ Rotation.from_euler("x", 50, degrees=True).as_matrix()  # axes of its own
+    assert agree(truth, replace(truth, R=R, photos=truth.photos[2:8]))
+    assert not agree(truth, replace(truth, R=R, photos=truth.photos[:3]))  # too few to tell
+    assert not agree(truth, replace(truth, R=turns @ truth.R))
+    poor = replace(truth, cost=0.31)
+    assert is_reliable(photos, poor, 1.0, confirmed=True)
+    assert not is_reliable(photos, poor, 0.9, confirmed=True)

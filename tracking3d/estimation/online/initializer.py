@@ -24,7 +24,7 @@ from tracking3d.estimation.online.features.klt import (
     has_texture,
     texture_strength,
 )
-from tracking3d.estimation.online.features.sift import Detector
+from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initialization.initial_map import (
     InitialMap,
     restart_without_points,
@@ -229,6 +229,8 @@ class Initializer:
 
     def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
+        from tracking3d.features.keypoint_network import NetworkDetector  # slow to import
+
         observer, camera = self.observer, self.observer.camera
         known = [view.strength for view in state.object_map.keyframes if view.strength < np.inf]
         if state.object_map.pointless and known and not has_texture(known):
@@ -236,7 +238,11 @@ class Initializer:
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        found, waiting, strengths = list[Photo](), list[Pending](), list[float]()
+        is_network = isinstance(observer.detector, NetworkDetector)
+        other: Detector = SIFT if is_network else NetworkDetector(NetworkDetector.Options())
+        detectors = observer.detector, other
+        kinds: tuple[list[Photo], ...] = tuple([] for _ in detectors)
+        waiting, strengths = list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):
             frame, binary = mask.on(frame), mask.found
             if binary is None:
@@ -248,10 +254,11 @@ class Initializer:
             pose = Pose.identity(torch.tensor(depth, dtype=torch.float32, device=observer.device))
             view = view_frame(observer, begun, frame, binary, pose, FollowedPoints.none())
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
-            found.append(Photo.of(frame.index, grey(frame.image), binary, observer.detector))
+            for found, detector in zip(kinds, detectors, strict=True):
+                found.append(Photo.of(frame.index, grey(frame.image), binary, detector))
             strengths.append(texture_strength(grey(frame.image), binary))
-        plain = bool(found) and not has_texture(strengths)  # no pair of photos is worth matching
-        start = None if plain else start_of_photos(found, camera)
+        plain = bool(waiting) and not has_texture(strengths)  # no pair of photos is worth matching
+        start = None if plain else start_of_photos(kinds, camera)
         if begun is None or start is None or start.structure is None:
             reason = _PLAIN if start is None else start.reason
             if isinstance(state, Initializing):
@@ -259,7 +266,7 @@ class Initializer:
             return state, PhotoEstimates((), reason)
         weights = FitWeights(smoothness=self.options.smoothness)
         views = [view for view, _ in waiting]
-        made, shown = initial_map_of_photos(begun.object_map, start, found, views, camera, weights)
+        made, shown = initial_map_of_photos(begun.object_map, start, kinds[0], views, camera, weights)
         pending = tuple((view, estimate) for view, (_, estimate) in zip(shown, waiting, strict=True))
         joined, last = self._make_map(replace(begun, pending=pending), made)
         estimates = [*last.revised, replace(last, revised=())]

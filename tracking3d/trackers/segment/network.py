@@ -32,6 +32,7 @@ _MASK, _COLOURS, _MOTION, _IS_BOX, _HAS_COLOURS = range(3, _CHANNELS)
 _MARGIN = 0.2  # free space around the box, as in training
 _COLOUR_SCALE, _MOTION_SCALE = 3.0, 2.0  # divisors of the log-odds of colours and of the motion cue
 _MOST = 4.0  # log-odds; beyond its crop there is no object
+_FIRST_MARGINS = (0.125, 0.2, 0.3)  # those of a first frame, or a photo, in which time does not matter
 
 
 _CLOSE = np.ones((5, 5), np.uint8)
@@ -55,7 +56,9 @@ class ObjectNetwork:
         """Itself: a copy of what uses the network shares it."""
         return self
 
-    def segment_box(self, image: Image, box: Box, margins: tuple[float, ...] = (_MARGIN,)) -> tuple[Map, Map]:
+    def segment_box(
+        self, image: Image, box: Box, margins: tuple[float, ...] = _FIRST_MARGINS
+    ) -> tuple[Map, Map]:
         """The object in a box, and what is in front of it, by nothing but one image.
 
         Every crop is seen twice, the second time mirrored.

@@ -109,8 +109,6 @@ _CUES = Cues(
     prior=0.5, outline=0.0, novelty=0.0,
     network=3.0, global_colours=0.5, local_colours=0.5, motion=1.0, background=0.5,
 )  # fmt: skip
-_FIRST_MARGINS = (0.125, 0.2, 0.3)
-"""Free space around the box in the crops of the first frame, in which time does not matter."""
 
 
 class SegmentTracker:
@@ -172,7 +170,7 @@ class SegmentTracker:
             motion=options.motion,
             background=options.background,
         )
-        likely, occluder = self._network.segment_box(frame.image, prompt.box, _FIRST_MARGINS)
+        likely, occluder = self._network.segment_box(frame.image, prompt.box)
         mask = prompt.mask
         if mask is None:
             mask = mask_with_network(frame.image, prompt.box, likely) > 0.5

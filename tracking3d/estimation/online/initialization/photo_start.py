@@ -4,7 +4,8 @@ Points that are followed from frame to frame do not last through steps of 10 deg
 turntable. Keypoints that are matched do. Two photos do not tell the turn between them while the lens is not known;
 three do (`structure_hypotheses`, under several lenses). To these the others are added one by one, each by the pose of
 the points that it shares (PnP), and all is adjusted together with the focal length (Snavely et al., "Photo tourism",
-2006). Several pairings of the photos compete, since an object may look alike from two sides.
+2006). Several pairings of the photos compete, since an object may look alike from two sides, and two kinds of
+keypoints.
 
 Whether the outcome is reliable is told by what was not fitted: the same outlines carved from all photos must fill the
 mask of each, a photo must show points that face it, and the reversal in depth must fit clearly worse.
@@ -15,13 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations, product
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
@@ -77,7 +79,9 @@ _SHORTEST, _LONGEST = 1.2, 14.0  # focal lengths in halves of the height: 80 and
 # of its reversal and itself and the facing either of which is evidence enough, and the least share of masks filled.
 _FEWEST_PHOTOS, _HIGHEST_COST, _CLEAR_RATIO, _CLEAR_FACING, _LEAST_FILLED = 4, 0.3, 1.5, 0.2, 0.95
 _LEAST_JOINED = 0.4  # share of the photos that is joined at least (chosen)
-_MOST_JOINED = 0.6  # share of the photos from which no other pairing of them is tried (chosen)
+_MOST_JOINED = 0.9  # share of the photos from which no other pairing or keypoints are tried (chosen)
+# Degrees between the turns of two structures that confirm each other, and in which share of their photos (chosen)
+_ALIKE, _ALIKE_SHARE = 3.0, 0.9
 _MANY_SHARED = 25  # matches of neighbours, at the median, from which it is not points that lack (chosen)
 # The block that silhouettes are carved out of: cells along a side, half a side in root mean square distances of the
 # points from their middle, share of the photos that must show a cell inside, and cells that a cell covers in a photo
@@ -439,36 +443,59 @@ class PhotoStart:
     structure: PhotoStructure | None  # None if none is reliable
     reason: str  # which photos are not joined, and what to do about that; empty if all are
 
+    @property
+    def joined(self) -> set[int]:
+        """Places of the joined photos."""
+        return set() if self.structure is None else {*self.structure.photos}
 
-def start_of_photos(photos: Sequence[Photo], camera: Camera) -> PhotoStart:
+
+def start_of_photos(kinds: Sequence[Sequence[Photo]], camera: Camera) -> PhotoStart:
     """Join photos of one object, as many as can be.
 
     Args:
-        photos: The photos, in the order in which they were most likely taken; at most `MOST_PHOTOS`.
+        kinds: The photos, in the order in which they were most likely taken, at most `MOST_PHOTOS`; once for each kind
+            of keypoints.
         camera: The camera of all; if its focal length is assumed, others are tried and the best is found.
     """
-    threshold = max(_LEAST_THRESHOLD, _THRESHOLD * float(np.median([photo.length for photo in photos])))
+    count = len(kinds[0])
+    threshold = max(_LEAST_THRESHOLD, _THRESHOLD * float(np.median([photo.length for photo in kinds[0]])))
     cameras = [camera.K]
     if camera.assumed:
         cameras = [
             camera.zoom(Camera.from_fov(camera.width, camera.height, angle).fy / camera.fy, "").K
             for angle in _FIELDS_OF_VIEW
         ]
-    neighbours = neighbouring_pairs(len(photos), _NEIGHBOURS)
-    best = PhotoStart(PhotoTracks(join_tracks(photos, {}), threshold), None, "")
-    matches: Matches = {}
-    for pairs in (neighbours, list(combinations(range(len(photos)), 2))):
-        found = match_photos(photos, set(pairs) - matches.keys(), cameras[0], threshold)
-        matches = {**matches, **found}
-        tracks = PhotoTracks(join_tracks(photos, matches), threshold, camera.assumed)
-        solved = [_upright(tracks, one) for one in solve_photos(tracks, cameras)]
-        reliable = [one for one, evidence in solved if is_reliable(photos, one, evidence)]
-        most = 0 if best.structure is None else len(best.structure.photos)
-        if reliable and len(reliable[0].photos) > most:
-            best = PhotoStart(tracks, reliable[0], "")
-        if best.structure is not None and len(best.structure.photos) >= _MOST_JOINED * len(photos):
+    best: PhotoStart | None = None
+    matches: list[Matches] = [{} for _ in kinds]
+    tried = list[tuple[int, PhotoTracks, PhotoStructure, float]]()
+    pairings = neighbouring_pairs(count, _NEIGHBOURS), list(combinations(range(count), 2))
+    for pairs, (kind, photos) in product(pairings, enumerate(kinds)):
+        found = match_photos(photos, set(pairs) - matches[kind].keys(), cameras[0], threshold)
+        matches[kind] = {**matches[kind], **found}
+        tracks = PhotoTracks(join_tracks(photos, matches[kind]), threshold, camera.assumed)
+        tried += [(kind, tracks, *_upright(tracks, one)) for one in solve_photos(tracks, cameras)]
+        for of, its_tracks, one, evidence in tried:
+            if best is not None and len(one.photos) <= len(best.joined):
+                continue
+            confirmed = any(agree(one, other) for other_kind, _, other, _ in tried if other_kind != of)
+            # Further keypoints alone must join nearly all: on the pot, those of the network join 5 and 7 of 12 wrongly.
+            believed = not of or confirmed or len(one.photos) >= _MOST_JOINED * count
+            if believed and is_reliable(photos, one, evidence, confirmed):
+                best = PhotoStart(its_tracks, one, "")
+        if best is not None and len(best.joined) >= _MOST_JOINED * count:
             break
-    return replace(best, reason=_why_not_joined(photos, matches, best.structure))
+    best = best or PhotoStart(PhotoTracks(join_tracks(kinds[0], {}), threshold), None, "")
+    return replace(best, reason=_why_not_joined(kinds[0], matches, best.joined))
+
+
+def agree(one: PhotoStructure, other: PhotoStructure) -> bool:
+    """Whether two structures, of keypoints of two kinds, turn their common photos alike."""
+    common = sorted({*one.photos} & {*other.photos})
+    if len(common) < _FEWEST_PHOTOS:
+        return False
+    turns = Rotation.from_matrix(one.R[common].transpose(0, 2, 1) @ other.R[common])
+    apart = (turns.mean().inv() * turns).magnitude()
+    return bool(np.degrees(np.quantile(apart, _ALIKE_SHARE)) < _ALIKE)
 
 
 def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure, float]:
@@ -480,24 +507,29 @@ def _upright(tracks: PhotoTracks, found: PhotoStructure) -> tuple[PhotoStructure
     return found, math.log(ratio) / math.log(_CLEAR_RATIO) + facing(found) / _CLEAR_FACING
 
 
-def is_reliable(photos: Sequence[Photo], found: PhotoStructure, evidence: float) -> bool:
-    """Whether photos are joined as the object has turned: points and outlines fit, and it is not reversed in depth."""
+def is_reliable(
+    photos: Sequence[Photo], found: PhotoStructure, evidence: float, confirmed: bool = False
+) -> bool:
+    """Whether photos are joined as the object has turned: points and outlines fit, and it is not reversed in depth.
+
+    If other keypoints have ``confirmed`` how it turned, the points may fit worse.
+    """
     return (
         len(found.photos) >= max(_FEWEST_PHOTOS, _LEAST_JOINED * len(photos))
-        and found.cost < _HIGHEST_COST
+        and (confirmed or found.cost < _HIGHEST_COST)
         and evidence >= 1
         and overlap_of_hull(photos, found) >= _LEAST_FILLED
     )
 
 
-def _why_not_joined(photos: Sequence[Photo], matches: Matches, found: PhotoStructure | None) -> str:
-    """Which photo is not joined, in words; empty if all are."""
-    count, joined = len(photos), set() if found is None else set(found.photos)
+def _why_not_joined(photos: Sequence[Photo], matches: Sequence[Matches], joined: set[int]) -> str:
+    """Which photo is not joined, in words, by its matches of each kind; empty if all are."""
+    count = len(photos)
     if len(joined) == count:
         return ""
     shared = np.zeros((count, count), int)
-    for (a, b), matched in matches.items():
-        shared[a, b] = shared[b, a] = len(matched)
+    for pair, matched in chain(*(kind.items() for kind in matches)):
+        shared[pair] = shared[pair[::-1]] = max(shared[pair], len(matched))
 
     def beside(photo: int) -> list[int]:
         return [place for place in (photo - 1, photo + 1) if 0 <= place < count]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,10 @@ from tracking3d.points.bundle_adjustment.reprojection import FloatArray
 
 # Of a photo, which has few neighbours (measured: 14 of 20 photos of the car are joined, with half as many keypoints 9).
 # Contrast and the ratio's distance from 1 are shares of the usual ones.
-_KEYPOINTS, _SIZE, _CONTRAST, _LOOSER = 1000, 600, 0.25, 0.75
+_LOOSER = 0.75
+_ONCE: dict[str, Any] = {"most": 1000, "size": 600, "contrast": 0.25}
+# In each of several turns (measured: 20 photos of the car are joined, and 19 with as many as above).
+_IN_TURNS: dict[str, Any] = {"most": 500, "size": 400, "contrast": 1.0}
 _STILL = 0.03  # share of the object's length; matches that move by less stand still (measured on the pot)
 _SILHOUETTE_SIZE = 160  # pixels along the longer side of a silhouette (chosen)
 _FEWEST_MATCHES, _LEAST_SHARE = 10, 0.15  # inliers of a pair, and their share of its matches (chosen)
@@ -73,7 +77,8 @@ class Photo:
     ) -> Photo:
         """Find the keypoints of a grey photo ``(H, W)`` inside a mask ``(H, W)`` that is not empty."""
         *_, width, height = cv2.boundingRect(mask.astype(np.uint8))
-        found = detect_turned(grey, mask, detector, most=_KEYPOINTS, size=_SIZE, contrast=_CONTRAST)
+        how = _ONCE if detector.rotation_invariant else _IN_TURNS
+        found = detect_turned(grey, mask, detector, **how)
         return cls(index, found, PhotoSilhouette.of(mask), float(max(width, height)))
 
     @property
