@@ -153,7 +153,7 @@ def _depth_map(
     # If the surface is too slanted, as if half turned towards the camera.
     towards = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
     normal = np.where((facing > _STEEPEST)[:, None], normal, normal + towards)
-    sweeps = [(normal, np.arange(-steps, steps + 1) * reach / steps)]
+    sweeps = [(normal, np.linspace(-reach, reach, 2 * steps + 1))]
     if wide:
         sweeps.append((towards, np.arange(steps // 2, _DEEPEST * steps) * reach / steps))
     T_cam_obj = view.T_cam_obj

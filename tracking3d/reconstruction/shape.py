@@ -96,7 +96,7 @@ def reconstruct_shape(
             f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed; film it turning further"
         )
     report_progress("carving the hull")
-    wide = _are_wide_apart(used)
+    wide = are_wide_apart(used)
     references = used if wide else spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
     score = partial(score_held_out, views=references, left_out=left_out)
     scored = start_in_thread(partial(score, *starts[0]), cv2.getNumThreads())
@@ -192,7 +192,7 @@ def largest_turn(rotations: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
 
 
-def _are_wide_apart(views: Sequence[ObjectView]) -> bool:
+def are_wide_apart(views: Sequence[ObjectView]) -> bool:
     """Whether the views are photos in wide steps, each far from the nearest other one."""
     R = np.stack([view.T_cam_obj[:3, :3] for view in views])
     traces = np.einsum("nij,mij->nm", R, R) - 4 * np.eye(len(R))
