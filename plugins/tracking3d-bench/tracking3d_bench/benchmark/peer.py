@@ -8,7 +8,6 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,7 +153,7 @@ def run_colmap(truth: Truth, asked: range, *, lowered: bool) -> tuple[Answers, f
         # In a process of its own: pycolmap brings libraries that torch has in other versions.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             found, seconds = pool.submit(_map_images, work, lowered).result()
-        none = Answers(truth.frames[0].parent, asked, frozenset(asked), T_cam_obj=MappingProxyType({}))
+        none = Answers(truth.frames[0].parent, asked, frozenset(asked), T_cam_obj={})
         answers = answers_from_colmap(work / "models", truth) if found else none
         return replace(answers, asked=asked), seconds
 
