@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14250,  # kernels of the joint fit; carried masks; restarts for live sources; two kinds of keypoints
+    "estimation": 14350,  # kernels of the joint fit; carried masks; live restarts; two kinds of keypoints; merged photos
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,

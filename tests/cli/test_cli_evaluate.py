@@ -238,6 +238,23 @@ def test_colmap_is_a_peer_whose_unregistered_frames_are_lost(call, clips, tmp_pa
     assert scores["rotation_error_median_deg"] == pytest.approx(0, abs=1e-4)
 
 
+def test_colmap_is_run_on_a_clip_and_a_run_stands_beside_it(call, refused, clips, monkeypatch):
+    from tracking3d_bench.benchmark import peer
+    from tracking3d_bench.datasets.answers import Answers
+
+    def found(truth, asked, *, lowered):
+        poses = {n: truth.T_cam_obj[n] for n in asked} if lowered else {}
+        return Answers(Path("colmap"), asked, frozenset(asked), T_cam_obj=poses), 1.0
+
+    monkeypatch.setattr(peer, "run_colmap", found)
+    arguments = ("evaluate", "peer", "colmap", "--truth", clips / "one", "--frames", "::2")
+    own, lower = json.loads(call(*arguments, "--json").stdout)
+    assert (own["views"], own["placed"], own["mean_deg"]) == (2, 0, 180)
+    assert (lower["views"], lower["within_10_deg"]) == (2, 2)
+    assert "lower thresholds" in call(*arguments).stdout
+    assert "leave out MODEL" in refused(*arguments[:3], "model", *arguments[3:])
+
+
 def test_the_answers_of_others_are_not_causal_or_final(refused, clips):
     arguments = ("evaluate", clips / "one/masks", "--truth", clips / "one", "--answers", "causal")
     assert "is no run folder, so it has no causal answers" in refused(*arguments)

@@ -14,6 +14,7 @@ from tracking3d.reconstruction.kernels.visual_hull import vary_little
 from tracking3d.reconstruction.meshing import Grid
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps, patch_scores
 from tracking3d.reconstruction.shape import (
+    are_wide_apart,
     carve_hull,
     depth_evidence,
     fuse_depth,
@@ -151,6 +152,24 @@ def test_patches_find_the_depth_of_a_ball():
     at_first, _ = guide.visible_to(maps[1].view)
     error, before = (np.abs(depth[known] - true[known]) for depth in (maps[1].depth, at_first))
     assert np.median(error) < 0.3 * np.median(before)
+
+
+def test_photos_in_wide_steps_find_what_lies_behind_the_surface_at_hand(around):
+    views = around[:5]  # 30 degrees apart
+    ball = sphere(8)
+    guide = Guide(1.4 * ball.vertices, ball.faces)
+    assert not depth_maps(views, views, guide, 0.12, 8)  # nobody to compare with
+    found = depth_maps(views, views, guide, 0.12, 8, wide=True)[1]
+    true, _ = Guide(ball.vertices, ball.faces).visible_to(found.view)
+    known = np.isfinite(found.depth) & np.isfinite(true)
+    assert known.sum() > 100
+    assert np.median(np.abs(found.depth[known] - true[known])) < 0.05
+
+
+@pytest.mark.parametrize(("step", "wide"), [(2, False), (8, False), (15, True), (30, True)])
+def test_photos_in_wide_steps_are_told_from_a_video(around, step, wide):
+    poses = [pose(step * n, 0) for n in range(9)]
+    assert are_wide_apart([replace(around[0], T_cam_obj=T) for T in poses]) is wide
 
 
 def test_kernel_and_twin_of_the_sweep_agree():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -30,6 +31,8 @@ NEIGHBOURS, AGREEING = 6, 3
 """Views that a patch is looked for in, and those of them that count."""
 BASELINE = (4.0, 25.0, 12.0)
 """Degrees between the directions of two views that are compared: least, most, and best."""
+_WIDEST = 40.0  # degrees, most between photos in wide steps (measured: a mug and others in steps of 30)
+_DEEPEST = 7.5  # reaches behind the surface at hand that are searched in them (chosen: across a mug)
 RADIUS = 3
 """Radius of a patch, pixels."""
 LEAST_CONTRAST = 3.0
@@ -78,6 +81,8 @@ def depth_maps(
     guide: Guide,
     reach: float,
     steps: int,
+    *,
+    wide: bool = False,
 ) -> list[DepthMap]:
     """The depths that the references see, as far as others say the same.
 
@@ -87,15 +92,17 @@ def depth_maps(
         guide: The surface around which to look.
         reach: How far from it, to either side.
         steps: Depths that are tried on either side.
+        wide: The views are photos in wide steps: views further apart are compared, and where no depth is found, as
+            inside a hollow thing whose mouth the surface closes, it is looked for all the way behind the surface.
     """
     grey = {view.index: _grey(view) for view in views}
     stride = _stride(references)
     maps = [
-        _depth_map(view, neighbours, grey, guide, reach, steps, stride)
+        _depth_map(view, neighbours, grey, guide, reach, steps, stride, wide)
         for view in report_each("matching depths", references)
-        if len(neighbours := _neighbours(view, views)) >= 2
+        if len(neighbours := _neighbours(view, views, _WIDEST if wide else BASELINE[1])) >= 2
     ]
-    return [_check_consistency(one, maps, reach / steps, stride) for one in maps]
+    return [_check_consistency(one, maps, reach / steps, stride, int(wide)) for one in maps]
 
 
 def _stride(references: Sequence[ObjectView]) -> int:
@@ -104,8 +111,8 @@ def _stride(references: Sequence[ObjectView]) -> int:
     return max(2, round(np.sqrt(largest / MOST_PIXELS)))
 
 
-def _neighbours(view: ObjectView, views: Sequence[ObjectView]) -> list[ObjectView]:
-    least, most, best = BASELINE
+def _neighbours(view: ObjectView, views: Sequence[ObjectView], most: float) -> list[ObjectView]:
+    least, _, best = BASELINE
     found = []
     for other in views:
         if other.index == view.index:
@@ -130,6 +137,7 @@ def _depth_map(
     reach: float,
     steps: int,
     stride: int,
+    wide: bool,
 ) -> DepthMap:
     drawn, normals = guide.visible_to(view)
     side = len(drawn)
@@ -145,26 +153,31 @@ def _depth_map(
     # If the surface is too slanted, as if half turned towards the camera.
     towards = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
     normal = np.where((facing > _STEEPEST)[:, None], normal, normal + towards)
-    offsets = np.linspace(-reach, reach, 2 * steps + 1)
+    sweeps = [(normal, np.linspace(-reach, reach, 2 * steps + 1))]
+    if wide:
+        sweeps.append((towards, np.arange(steps // 2, _DEEPEST * steps) * reach / steps))
     T_cam_obj = view.T_cam_obj
     P = np.stack([other.K @ (other.T_cam_obj @ np.linalg.inv(T_cam_obj))[:3] for other in neighbours])
-    scores, contrast = patch_scores(
-        grey[view.index],
-        view.mask.astype(np.float32),
-        K_inverse,
-        np.stack([grey[other.index] for other in neighbours]),
-        P,
-        pixels,
-        first,
-        normal,
-        offsets,
-    )
+    others = np.stack([grey[other.index] for other in neighbours])
     depth, score = (np.full((side, side), fill, np.float32) for fill in (np.nan, -1.0))
-    place, value = _peak(scores)
-    kept = (contrast >= LEAST_CONTRAST) & (value >= LEAST_SCORE) & np.isfinite(place)
-    at = tuple(pixels[kept].T)
-    depth[at] = (first + np.interp(place, np.arange(len(offsets)), offsets))[kept]
-    score[at] = value[kept]
+    for facing_normal, offsets in sweeps:
+        rest = np.isnan(depth[tuple(pixels.T)])
+        scores, contrast = patch_scores(
+            grey[view.index],
+            view.mask.astype(np.float32),
+            K_inverse,
+            others,
+            P,
+            pixels[rest],
+            first[rest],
+            facing_normal[rest],
+            offsets,
+        )
+        place, value = _peak(scores)
+        kept = (contrast >= LEAST_CONTRAST) & (value >= LEAST_SCORE) & np.isfinite(place)
+        at = tuple(pixels[rest][kept].T)
+        depth[at] = (first[rest] + np.interp(place, np.arange(len(offsets)), offsets))[kept]
+        score[at] = value[kept]
     return DepthMap(view, depth, score, stride)
 
 
@@ -225,8 +238,10 @@ def _peak(scores: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.where(inner, place, np.nan).astype(np.float32), here
 
 
-def _check_consistency(one: DepthMap, maps: Sequence[DepthMap], tolerance: float, stride: int) -> DepthMap:
-    """With those depths alone that at least one other map confirms."""
+def _check_consistency(
+    one: DepthMap, maps: Sequence[DepthMap], tolerance: float, stride: int, around: int
+) -> DepthMap:
+    """With those depths alone that at least one other map confirms, by one of the pixels ``around`` too."""
     view = one.view
     rows, columns = np.nonzero(np.isfinite(one.depth))
     z = one.depth[rows, columns].astype(np.float64)
@@ -237,11 +252,13 @@ def _check_consistency(one: DepthMap, maps: Sequence[DepthMap], tolerance: float
         if other is one or other.view.T_cam_obj[2, :3] @ view.T_cam_obj[2, :3] < 0.5:
             continue
         x, y, depth = other.view.P[:, :3] @ points.T + other.view.P[:, 3:]
-        column, row = (
-            np.round(np.clip(value / depth / stride, 0, (len(one.depth) - 1) // stride)).astype(int) * stride
-            for value in (x, y)
-        )
-        confirmed += np.abs(other.depth[row, column] - depth) < 2 * tolerance
+        last = (len(one.depth) - 1) // stride
+        column, row = (np.round(np.clip(value / depth / stride, 0, last)).astype(int) for value in (x, y))
+        near = np.zeros(len(points), bool)
+        for down, right in product(range(-around, around + 1), repeat=2):
+            at = np.clip(row + down, 0, last) * stride, np.clip(column + right, 0, last) * stride
+            near |= np.abs(other.depth[at] - depth) < 2 * tolerance
+        confirmed += near
     kept = np.full_like(one.depth, np.nan)
     sure = confirmed >= 1
     kept[rows[sure], columns[sure]] = one.depth[rows[sure], columns[sure]]

@@ -44,6 +44,7 @@ LEAST_TURN = 20.0
 MOST = 60
 """Frames that a shape is made from; of more, those that differ most (measured: 40 lose .06 dB on box_in_hand)."""
 _APART, _REFERENCES_APART, _REFERENCES = 1.0, 6.0, 20  # degrees between views, and between those with a depth
+_WIDE = 10.0  # degrees from a view to the nearest one, at the median, from which they are photos in wide steps (chosen)
 _MARGIN = 0.15
 _TRUNCATION = 0.04  # of the object's diagonal
 _COARSE, _CELLS = (
@@ -95,10 +96,11 @@ def reconstruct_shape(
             f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed; film it turning further"
         )
     report_progress("carving the hull")
-    references = spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
+    wide = are_wide_apart(used)
+    references = used if wide else spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
     score = partial(score_held_out, views=references, left_out=left_out)
     scored = start_in_thread(partial(score, *starts[0]), cv2.getNumThreads())
-    grid, inside, planes = _volume(starts, used, references)
+    grid, inside, planes = _volume(starts, used, references, wide)
     report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
     if mesh is None:
@@ -123,6 +125,7 @@ def _volume(
     starts: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
     views: Sequence[ObjectView],
     references: Sequence[ObjectView],
+    wide: bool,
 ) -> tuple[Grid, FloatArray, list[SymmetryPlane]]:
     """All evidence in a volume, positive inside, and the planes by which it was completed."""
     vertices = np.concatenate([points for points, _ in starts])
@@ -132,7 +135,7 @@ def _volume(
     around, _ = carve_hull(coarse.points, views, 2 * truncation)
     prior = _prior(coarse, around, starts, references, truncation)
     guide = _guide(coarse, around, prior, *starts[0])
-    maps = depth_maps(views, references, guide, _REACH * diagonal, _STEPS)
+    maps = depth_maps(views, references, guide, _REACH * diagonal, _STEPS, wide=wide)
     grid = coarse.around_centres(around > -coarse.spacing, coarse.spacing * _COARSE / _CELLS)
     hull = coarse.resample(around, grid)
     near = np.abs(hull) < _BAND * coarse.spacing
@@ -187,6 +190,13 @@ def largest_turn(rotations: NDArray[np.float64]) -> float:
     """Degrees between the two of several rotations ``(N, 3, 3)`` that differ most."""
     traces = np.einsum("nij,mij->nm", rotations, rotations)
     return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
+
+
+def are_wide_apart(views: Sequence[ObjectView]) -> bool:
+    """Whether the views are photos in wide steps, each far from the nearest other one."""
+    R = np.stack([view.T_cam_obj[:3, :3] for view in views])
+    traces = np.einsum("nij,mij->nm", R, R) - 4 * np.eye(len(R))
+    return bool(np.median(traces.max(1)) < 1 + 2 * np.cos(np.radians(_WIDE)))
 
 
 def _keep_mesh(

@@ -22,6 +22,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
     facing,
     is_reliable,
     keep_connected,
+    merge,
     overlap_of_hull,
     reverse,
     start_of_photos,
@@ -305,6 +306,29 @@ def test_photos_that_agree_with_one_other_only_are_given_up():
     seen[5] &= ~tracks.visible[:4].any(0)
     kept = keep_connected(tracks, replace(truth, R=R, seen=seen))
     assert sorted(kept.photos) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(("common", "apart"), [(0, 0.15), (6, 0.01)])
+def test_structures_that_share_one_photo_are_merged(common, apart):
+    """As at the edge of a box: photo 3 shares points with photos 0 to 2 and 4 to 6, which share few or none."""
+    tracks, truth = solid(7, 20.0, 300)
+    across = np.flatnonzero(tracks.visible[:3].any(0) & tracks.visible[4:].any(0))[common:]
+    tracks.visible[4:, across[::2]] = False
+    tracks.visible[:3, across[1::2]] = False
+    truth = replace(truth, seen=tracks.visible.copy())
+    one, other = (
+        triangulate(tracks, replace(without_points(truth), photos=photos))
+        for photos in ((0, 1, 2, 3), (3, 4, 5, 6))
+    )
+    turn = Rotation.from_euler("xyz", [40, 70, 10], degrees=True).as_matrix()
+    other = replace(other, R=truth.R @ turn, t=0.5 * truth.t, points=0.5 * other.points @ turn)
+    made = merge(tracks, one, other)
+    assert made is not None and sorted(made.photos) == list(range(7))
+    turned = Rotation.from_matrix(made.R @ truth.R.transpose(0, 2, 1)).magnitude()
+    assert np.degrees(turned).max() < 1
+    assert np.abs(made.t[6] - truth.t[6]).max() < apart * 5
+    assert len(keep_connected(tracks, replace(made, joints=frozenset())).photos) == 4 or common
+    assert merge(tracks, made, other) is None  # it has nothing new
 
 
 # ------------------------------------------------------------------ what is reliable

@@ -68,6 +68,9 @@ _SHARED_POINTS = 5  # known points in a photo from which it can be added
 _LEAST_POINTS, _LEAST_SHARE = 10, 0.5
 # Points that two photos share at least, and the share that fits if they agree
 _LINK_POINTS, _LINK_SHARE = 8, 0.65
+_COMMON_OF_PIECES = (
+    3  # points that two structures know in the photo that they share, to tell their sizes (chosen)
+)
 _CLEAR_SHARE = 0.8  # share of the observations from which no other pose of a photo is tried (chosen)
 _ENOUGH_JOINED = 0.9  # share of the photos from which no other start is tried (chosen)
 _ROUNDS = 3
@@ -119,6 +122,7 @@ class PhotoStructure:
     seen: NDArray[np.bool_]  # (F, N) the observations that fit
     K: FloatArray  # (3, 3)
     cost: float = math.inf  # mean Cauchy loss of the observations
+    joints: frozenset[int] = frozenset()  # photos by which alone structures were merged
 
     @property
     def order(self) -> NDArray[np.intp]:
@@ -238,8 +242,8 @@ def _links(tracks: PhotoTracks, found: PhotoStructure) -> NDArray[np.bool_]:
     return linked
 
 
-def _connected(linked: NDArray[np.bool_]) -> set[int]:
-    """The most photos that hang together by threes of which all agree, neighbouring threes sharing two.
+def _connected(linked: NDArray[np.bool_], joints: frozenset[int]) -> set[int]:
+    """The most photos that hang together by threes of which all agree, neighbouring threes sharing two, or a joint.
 
     A wrong pose mostly agrees with one neighbour, on which it was based, and not with the next one too.
     """
@@ -253,7 +257,7 @@ def _connected(linked: NDArray[np.bool_]) -> set[int]:
         photos, edges = set(triple), set(combinations(triple, 2))
         apart = []
         for group in groups:
-            if group[1] & edges:
+            if group[1] & edges or group[0] & photos & joints:
                 photos, edges = photos | group[0], edges | group[1]
             else:
                 apart.append(group)
@@ -263,7 +267,7 @@ def _connected(linked: NDArray[np.bool_]) -> set[int]:
 
 def keep_connected(tracks: PhotoTracks, found: PhotoStructure) -> PhotoStructure:
     """Without photos that do not agree with the others."""
-    kept = _connected(_links(tracks, found))
+    kept = _connected(_links(tracks, found), found.joints)
     if not kept:
         return replace(found, cost=math.inf)
     if len(kept) == len(found.photos):
@@ -376,8 +380,63 @@ def solve_photos(tracks: PhotoTracks, cameras: Sequence[FloatArray]) -> list[Pho
         if math.isfinite(one.cost):
             grown.append(one)
         if len(one.photos) >= _ENOUGH_JOINED * len(tracks.visible):
-            break
-    return sorted(grown, key=lambda one: (-len(one.photos), -one.support))
+            return sorted(grown, key=_rank)
+    pieces = {frozenset(one.photos): one for one in sorted([*grown, *begun], key=_rank, reverse=True)}
+    if len(pieces) > 1:
+        whole = _merge_all(tracks, [_upright(tracks, one)[0] for one in sorted(pieces.values(), key=_rank)])
+        grown.append(grow(tracks, whole, len(tracks.visible)))
+    return sorted((one for one in grown if math.isfinite(one.cost)), key=_rank)
+
+
+def _rank(found: PhotoStructure) -> tuple[float, float]:
+    return -len(found.photos), -found.support
+
+
+def _merge_all(tracks: PhotoTracks, pieces: Sequence[PhotoStructure]) -> PhotoStructure:
+    """The first of several structures, with all that can be merged into it."""
+    whole, before = pieces[0], 0
+    while before < len(whole.photos):
+        before = len(whole.photos)
+        for piece in pieces[1:]:
+            made = merge(tracks, whole, piece)
+            if made is not None and {*made.photos} > {*whole.photos}:
+                whole = made
+    return whole
+
+
+def merge(tracks: PhotoTracks, one: PhotoStructure, other: PhotoStructure) -> PhotoStructure | None:
+    """Two structures that share a photo; None if it is all of one of them, or they do not fit.
+
+    Where sides of a box follow each other in wide steps, the photo of an edge has many points in common with those
+    before and after it, which have none with each other: no point is seen in three. Of the two structures only the
+    ratio of their sizes is open: points that both know tell it, or how far those of each are from the shared photo.
+    """
+    shared, new = [*{*one.photos} & {*other.photos}], [q for q in other.photos if q not in one.photos]
+    if not (shared and new and len(shared) < len(one.photos)):
+        return None
+    shown = one.observations.sum(1), other.observations.sum(1)
+    joint = max(shared, key=lambda photo: min(int(count[photo]) for count in shown))
+    R0, t0, R1, t1 = one.R[joint], one.t[joint], other.R[joint], other.t[joint]
+    from_one, from_other = transform_to_camera(R0, t0, one.points), transform_to_camera(R1, t1, other.points)
+    both = one.known & other.known & tracks.visible[joint]
+    ratio = from_one[both, 2] / from_other[both, 2]
+    if len(ratio) < _COMMON_OF_PIECES:
+        near, far = from_one[one.observations[joint], 2], from_other[other.observations[joint], 2]
+        ratio = np.median(near) / far
+    size = float(np.median(ratio))
+    R, t, points, seen = one.R.copy(), one.t.copy(), one.points.copy(), one.seen.copy()
+    for photo in new:
+        turn = other.R[photo] @ R1.T
+        R[photo], t[photo] = turn @ R0, turn @ t0 + size * (other.t[photo] - turn @ t1)
+    gained = other.known & ~one.known
+    points[gained] = (size * from_other[gained] - t0) @ R0
+    seen[new] = tracks.visible[new]
+    joints = one.joints | other.joints | {joint}
+    made = replace(one, photos=(*one.photos, *new), R=R, t=t, points=points, seen=seen, joints=joints)
+    for _ in range(2):
+        made = adjust_all(tracks, triangulate(tracks, made), 25)
+    made = keep_connected(tracks, made)
+    return made if math.isfinite(made.cost) else None
 
 
 def reverse(tracks: PhotoTracks, found: PhotoStructure) -> PhotoStructure:
