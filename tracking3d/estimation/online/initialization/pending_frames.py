@@ -357,8 +357,13 @@ class ImageChange:
 
 
 def image_change(first: Observation, second: Observation) -> ImageChange:
-    """The change from one observation of an object to another, both with a mask, as the masks' similarity leaves it."""
-    mask_a, mask_b = (np.ascontiguousarray(one.mask.cpu().numpy(), np.float32) for one in (first, second))
+    """The change from one observation of an object to another, both with a mask, as the masks' similarity leaves it.
+
+    What covers the object in either of them is left out: a thumb that moves is no turn.
+    """
+    mask_a, mask_b = (
+        np.ascontiguousarray(one.completed_mask.cpu().numpy(), np.float32) for one in (first, second)
+    )
     if not mask_a.any() or not mask_b.any():
         return ImageChange(0.0, 0.0)
     grey_a, grey_b = (_grey(one) for one in (first, second))
@@ -370,6 +375,14 @@ def image_change(first: Observation, second: Observation) -> ImageChange:
         return np.asarray(cv2.warpAffine(image, similarity, size, flags=flags), np.float32)
 
     mask_b, grey_b = warped(mask_b), warped(grey_b)
+    hidden = np.zeros(mask_a.shape, bool)
+    if first.occluder is not None:
+        hidden |= first.occluder.cpu().numpy() > 0.5
+    if second.occluder is not None:
+        hidden |= warped(np.ascontiguousarray(second.occluder.cpu().numpy(), np.float32)) > 0.5
+    mask_a, mask_b = (np.where(hidden, np.float32(0), mask) for mask in (mask_a, mask_b))
+    if not mask_a.any() or not mask_b.any():
+        return ImageChange(0.0, 0.0)
     outline = 1 - float(np.minimum(mask_a, mask_b).sum() / np.maximum(mask_a, mask_b).sum())
     both = ((mask_a > _INSIDE) & (mask_b > _INSIDE)).astype(np.uint8)
     inside = cv2.erode(both, np.ones((_MARGIN, _MARGIN), np.uint8)) > 0
