@@ -22,7 +22,7 @@ from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.initialization.initial_map import restart_without_points
 from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens, with_focal_length
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
-from tracking3d.estimation.online.mapping.global_refinement import refine_globally
+from tracking3d.estimation.online.mapping.global_refinement import refine_globally, refit_without_points
 from tracking3d.estimation.online.mapping.keyframe_insertion import prune_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import refine_map
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
@@ -54,6 +54,8 @@ def refine_active_map(state: Mapped, config: OnlineConfig) -> Mapped:
         if object_map.free_axis is None:
             object_map = restart_without_points(object_map, camera, weights)
             object_map = as_surface_of_revolution(object_map, weights, others)
+        if object_map.free_axis is None and len(object_map.keyframes) > 1:
+            object_map = refit_without_points(object_map, weights)
     object_map, camera = refine_globally(object_map, camera, config)
     return replace(
         _with_final_map(state, object_map, camera),
