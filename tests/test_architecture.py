@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1500,  # the interval of asking the mask tracker
     "engines": 900,
     "errors": 50,
-    "estimation": 14350,  # kernels of the joint fit: a start without points takes half its time; carried masks
+    "estimation": 14400,  # kernels of the joint fit, carried masks; models of plain things from all of the video
     "export": 2750,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,

@@ -48,15 +48,17 @@ _BUNDLE_ITERATIONS, _ROUNDS = 15, 2
 def refine_active_map(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state for the final estimates, its active map refined with all keyframes and the focal length if assumed."""
     object_map, camera = state.object_map, state.camera
-    if object_map.pointless and not object_map.fixed_keyframes:
-        weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
+    weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
+    plain = object_map.pointless and not object_map.fixed_keyframes
+    if plain:
         object_map = as_surface_of_revolution(object_map, weights, others)
         if object_map.free_axis is None:
             object_map = restart_without_points(object_map, camera, weights)
             object_map = as_surface_of_revolution(object_map, weights, others)
-        if object_map.free_axis is None and len(object_map.keyframes) > 1:
-            object_map = refit_without_points(object_map, weights)
-    object_map, camera = refine_globally(object_map, camera, config)
+    if plain and object_map.free_axis is None:
+        object_map = refit_without_points(object_map, weights)
+    else:
+        object_map, camera = refine_globally(object_map, camera, config)
     return replace(
         _with_final_map(state, object_map, camera),
         unaligned=False,

@@ -375,15 +375,13 @@ def image_change(first: Observation, second: Observation) -> ImageChange:
         return np.asarray(cv2.warpAffine(image, similarity, size, flags=flags), np.float32)
 
     mask_b, grey_b = warped(mask_b), warped(grey_b)
-    hidden = np.zeros(mask_a.shape, bool)
-    if first.occluder is not None:
-        hidden |= first.occluder.cpu().numpy() > 0.5
-    if second.occluder is not None:
-        hidden |= warped(np.ascontiguousarray(second.occluder.cpu().numpy(), np.float32)) > 0.5
+    covered_a, covered_b = (
+        np.zeros(mask_a.shape, np.float32) if one.occluder is None else one.occluder.cpu().numpy()
+        for one in (first, second)
+    )
+    hidden = (covered_a > 0.5) | (warped(np.ascontiguousarray(covered_b)) > 0.5)
     mask_a, mask_b = (np.where(hidden, np.float32(0), mask) for mask in (mask_a, mask_b))
-    if not mask_a.any() or not mask_b.any():
-        return ImageChange(0.0, 0.0)
-    outline = 1 - float(np.minimum(mask_a, mask_b).sum() / np.maximum(mask_a, mask_b).sum())
+    outline = 1 - float(np.minimum(mask_a, mask_b).sum() / max(np.maximum(mask_a, mask_b).sum(), 1e-6))
     both = ((mask_a > _INSIDE) & (mask_b > _INSIDE)).astype(np.uint8)
     inside = cv2.erode(both, np.ones((_MARGIN, _MARGIN), np.uint8)) > 0
     shading = float(np.abs(grey_a - grey_b)[inside].mean()) if inside.any() else 0.0

@@ -24,6 +24,7 @@ from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
+from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_from_arrays
 from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
@@ -70,13 +71,17 @@ def refit_without_points(object_map: ObjectMap, weights: FitWeights) -> ObjectMa
         object_map: The map; at most `_VIEWS_WITHOUT_POINTS` of its keyframes stay.
         weights: The weights of the shape's terms.
     """
+    if len(object_map.keyframes) < 2:
+        return object_map
     count = min(_VIEWS_WITHOUT_POINTS, len(object_map.keyframes))
     places = np.linspace(0, len(object_map.keyframes) - 1, count).round().astype(int)
     spread = replace(object_map, keyframes=tuple(object_map.keyframes[place] for place in places))
     modes = ShapeBasis.of(object_map.shape)
     starts = [replace(spread, vertices=vertices) for vertices in (spread.vertices, object_map.shape.rest)]
     fits = [fit_jointly(start, modes, weights, _EVALUATIONS) for start in starts]
-    return min(fits, key=lambda one: one[1])[0].with_textures()
+    fitted = min(fits, key=lambda one: one[1])[0]
+    vertices = flatten(fitted.vertices) if fitted.shape.flat else fitted.vertices
+    return replace(fitted, vertices=vertices).with_textures()
 
 
 def keyframe_cost(object_map: ObjectMap) -> float:
