@@ -1,8 +1,11 @@
-"""Garbage is left alone while modules are imported."""
+"""Garbage is left alone while modules are imported, and what is free goes back to the system."""
 
 from __future__ import annotations
 
 import gc
+import platform
+import subprocess
+import sys
 
 import pytest
 
@@ -42,3 +45,18 @@ def test_an_error_within_enables_collection_again():
     with pytest.raises(ValueError), collection_deferred():
         raise ValueError
     assert gc.isenabled()
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries need no help")
+def test_free_memory_between_what_is_held_goes_back_to_the_system():
+    script = """
+import ctypes, numpy
+from tracking3d.runtime.memory import release_free_memory, resident_memory
+ctypes.CDLL(None).mallopt(-3, 32 << 20)  # as the command line does
+arrays = [numpy.ones(100_000) for _ in range(400)]
+del arrays[::2]
+before = resident_memory()[0]
+release_free_memory()
+assert resident_memory()[0] < before - 100, (before, resident_memory())
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)

@@ -32,13 +32,13 @@ from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.reconstruction.confidence import refined_confidence_features as supported_by
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.logistic_model import LogisticModel
 from tracking3d_bench.benchmark.job import JOB, RUN, Job
 from tracking3d_bench.datasets.run_answers import answers_of_run
 from tracking3d_bench.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
 from tracking3d_bench.evaluation.confidence_fit import (
     PENALTY,
-    LogisticConfidence,
-    as_python_source,
+    as_logistic_model,
     fit_confidence,
     halves,
 )
@@ -135,11 +135,12 @@ def balanced(frames: list[Judged]) -> np.ndarray:
 
 def fit_groups(
     frames: list[Judged], names: list[str], signs: dict[str, int], penalty: float
-) -> LogisticConfidence:
+) -> LogisticModel:
     """The fit on all groups; for every group it is printed what a fit on the others is worth there."""
     groups = sorted({one.group for one in frames})
     if len(groups) < 2:
         raise InputError("At least two folders with finished runs are needed for --balance; give more.")
+    errors = []
     for group in groups:
         others = [one for one in frames if one.group != group]
         fit = fit_confidence(*table(others, names), signs, penalty, balanced(others))
@@ -147,12 +148,11 @@ def fit_groups(
         evidence, right = table(held_out, names)
         recorded = np.array([one.evidence["recorded"] for one in held_out])
         print(f"{group}: {len(right)} frames, {right.mean():.2f} right")
-        print(f"  fitted on the others: {tested(fit(evidence), held_out)}")
+        errors.append(f"{group}: {tested(fit(evidence), held_out)}")
+        print(f"  fitted on the others: {errors[-1]}")
         print(f"  recorded:             {tested(recorded, held_out)}")
-    everything = fit_confidence(*table(frames, names), signs, penalty, balanced(frames))
-    print("\n# fitted on all groups:")
-    print(as_python_source(everything))
-    return everything
+    fit = fit_confidence(*table(frames, names), signs, penalty, balanced(frames))
+    return as_logistic_model(fit, f"{len(frames)} frames of {', '.join(groups)}", "; ".join(errors))
 
 
 def tested(said: np.ndarray, frames: list[Judged]) -> str:
@@ -182,25 +182,23 @@ def main(words: list[str]) -> None:
     frames = [one for one in frames if any(name in one.evidence for name in names)]
     signs = {name.lstrip("+-"): 1 if name[0] == "+" else -1 for name in asked if name[:1] in ("+", "-")}
     if options.balance:
-        found = fit_groups(frames, names, signs, options.penalty)
-        if options.json:
-            options.json.write_text(json.dumps({"all": asdict(found)}, indent=1))
+        _print(fit_groups(frames, names, signs, options.penalty), options.json)
         return
     first, second = halves([one.sequence for one in frames])
     if not second:
         raise InputError("At least two sequences with finished runs are needed; give other folders.")
-    fits: list[LogisticConfidence] = []
+    errors = []
     for fitted, other in ((first, second), (second, first)):
         tests = [one for one in frames if one.sequence in other]
         learnt, held_out = (
             table(half, names) for half in ([one for one in frames if one.sequence in fitted], tests)
         )
-        fits.append(fit_confidence(*learnt, signs, options.penalty))
         evidence, right = held_out
-        said = fits[-1](evidence)
+        said = fit_confidence(*learnt, signs, options.penalty)(evidence)
         print(f"fitted on {len(fitted)} sequences, {len(learnt[1])} frames, {learnt[1].mean():.2f} right")
         print(f"tested on {len(other)} sequences, {len(right)} frames, {right.mean():.2f} right")
-        print(f"  fitted:   {tested(said, tests)}")
+        errors.append(tested(said, tests))
+        print(f"  fitted:   {errors[-1]}")
         recorded = table(tests, ["recorded"])[0]["recorded"]
         if np.isfinite(recorded).all():
             print(f"  recorded: {tested(recorded, tests)}")
@@ -211,12 +209,16 @@ def main(words: list[str]) -> None:
             if count:
                 print(f"  {low:.1f} to {high:.1f}: {count:5d} frames, said {mean:.2f}, right {share:.2f}")
     everything = fit_confidence(*table(frames, names), signs, options.penalty)
-    print("\n# fitted on the first half:")
-    print(as_python_source(fits[0]))
-    print("\n# fitted on all sequences:")
-    print(as_python_source(everything))
-    if options.json:
-        options.json.write_text(json.dumps({"half": asdict(fits[0]), "all": asdict(everything)}, indent=1))
+    data = f"{len(frames)} frames of {len(first + second)} sequences"
+    _print(as_logistic_model(everything, data, f"of halves: {'; '.join(errors)}"), options.json)
+
+
+def _print(model: LogisticModel, file: Path | None) -> None:
+    """The table as the package reads it, on standard output and into a file."""
+    text = json.dumps(asdict(model), indent=1)
+    print(f"\n{text}")
+    if file is not None:
+        file.write_text(f"{text}\n", encoding="utf-8")
 
 
 def _all_losses(frames: list[Judged]) -> list[str]:
@@ -234,7 +236,9 @@ def _options(words: list[str]) -> argparse.Namespace:
         "--penalty", type=float, default=PENALTY, help="how much small coefficients are liked"
     )
     parser.add_argument("--balance", action="store_true", help="folders are groups that count alike")
-    parser.add_argument("--json", type=Path, help="write the coefficients there too")
+    parser.add_argument(
+        "--json", type=Path, help="write the table there, as those in tracking3d/runtime/weights"
+    )
     return parser.parse_args(words)
 
 

@@ -25,7 +25,7 @@ from tracking3d.pipeline.submaps.split_run import Step
 
 @dataclass(frozen=True)
 class Cut:
-    """Stands for `Begun`."""
+    """Stands for `PlannedVideo`."""
 
     folder: Path
     count: int = 4
@@ -51,14 +51,14 @@ def cut(monkeypatch, finished_run):
         for folder in folders:
             shutil.copytree(finished_run, folder)
 
-    def steps_of(begun):
+    def steps_of(planned):
         answers = yield [Step(part, number, f"part {number} of 2", 2) for number in (1, 2)]
         assert answers == [10, 20]
-        folders = [begun.folder / "parts" / f"part_{n}" for n in (0, 1)] if refused else [begun.folder]
+        folders = [planned.folder / "parts" / f"part_{n}" for n in (0, 1)] if refused else [planned.folder]
         yield [Step(end, folders, "its end")]
         return SplitResult(tuple(folders), 2, *refused)
 
-    monkeypatch.setattr(tasks, "begin", begin)
+    monkeypatch.setattr(tasks, "plan_video", begin)
     monkeypatch.setattr(tasks, "steps_of", steps_of)
     return done, faults, refused
 

@@ -30,6 +30,7 @@ SCRIPTS = (
     "first_answers",
     "keypoint_matches",
     "render",
+    "run_passes",
     "same_answers",
     "schedule",
     "soak",

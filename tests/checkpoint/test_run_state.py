@@ -46,7 +46,7 @@ def test_a_run_that_is_stopped_saves_its_last_step(folder):
 
 
 def test_rollback_points_are_saved_between(folder):
-    assert steps(RunState(Checkpoint(folder, (), milestones=8)), 13) == [0, 3, 7, 10, 11]
+    assert steps(RunState(Checkpoint(folder, (), rollback_points=8)), 13) == [0, 3, 7, 10, 11]
 
 
 def test_it_is_saved_at_once_when_earlier_frames_have_other_estimates(folder):

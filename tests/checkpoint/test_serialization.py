@@ -153,7 +153,7 @@ def test_strangers_are_removed_and_never_taken_for_ones_own(tmp_path):
     (tmp_path / "00000001.npz").write_bytes(b"half of an array")
     later = TreeFolder(tmp_path, CLASSES)
     assert_same(later.read(json.loads(text)), LARGE)
-    later.clear_strangers()
+    later.remove_orphans()
     assert files(tmp_path) == ["00000000.npz"]
 
 

@@ -183,7 +183,17 @@ def test_run_folder_page_names_every_file_and_key():
     names = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
     files = [value for value in names if value.isprintable()]  # what sentences call arguments is not
     renderer = prepare_backend("auto", "cpu")
-    start = description_at_start(RunHeader({}, Camera.from_fov(4, 4), "", 0, None, None, renderer=renderer))
+    start = description_at_start(
+        RunHeader(
+            config={},
+            camera=Camera.from_fov(4, 4),
+            source="",
+            seed=0,
+            fps=None,
+            command=None,
+            renderer=renderer,
+        )
+    )
     end = summary([], 0, {})
     keys = {
         *start,

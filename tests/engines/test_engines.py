@@ -12,7 +12,7 @@ import pytest
 from tracking3d.engines.choosing import InThisProcess, open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine, default_workers
-from tracking3d.engines.protocol import Began, Ended, Fault, Needs, Task, Told
+from tracking3d.engines.protocol import Began, Ended, Fault, Needs, ProgressReport, Task
 from tracking3d.errors import InputError
 
 
@@ -23,7 +23,7 @@ def test_results_come_by_number_and_everything_is_told(engine, tmp_path):
     assert {number: one.value for number, one in ended.items()} == {1: 1, 2: 4, 3: 9}
     for number in (1, 2, 3):
         own = [type(event) for event in told if event.number == number]
-        assert own == [Began, Told, Ended]
+        assert own == [Began, ProgressReport, Ended]
         assert (tmp_path / f"{number}.log").read_text() == f"squared {number}\n"
 
 
@@ -89,7 +89,7 @@ def test_what_stops_the_loop_lets_tasks_keep_what_is_done(tmp_path):
     note = tmp_path / "note"
 
     def interrupt(event):
-        if isinstance(event, Told):
+        if isinstance(event, ProgressReport):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -101,7 +101,7 @@ def test_a_worker_whose_master_is_gone_stops(tmp_path):
     engine = ProcessEngine(1)
     note = tmp_path / "note"
     engine.start(Task(1, tasks.told_to_stop, (note,)))
-    while not any(isinstance(event, Told) for event in engine.wait(1.0)):
+    while not any(isinstance(event, ProgressReport) for event in engine.wait(1.0)):
         pass
     running = engine._running[1]
     running.connection.close()

@@ -13,7 +13,7 @@ from tracking3d.engines import on_ray
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.on_ray import RayEngine
-from tracking3d.engines.protocol import Began, Needs, Task, Told
+from tracking3d.engines.protocol import Began, Needs, ProgressReport, Task
 from tracking3d.errors import InputError
 
 pytestmark = [
@@ -59,7 +59,7 @@ def test_faults_retries_and_stops_are_those_of_processes(ray, here, tmp_path):
         note = tmp_path / "note"
 
         def interrupt(event):
-            if isinstance(event, Told):
+            if isinstance(event, ProgressReport):
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
@@ -76,7 +76,9 @@ def test_a_node_that_goes_costs_nothing_but_time(ray, here, tmp_path):
 
     def remove(event):
         nonlocal removed
-        if isinstance(event, Told) and event.content == second.node_id:  # for three seconds from now on
+        if (
+            isinstance(event, ProgressReport) and event.content == second.node_id
+        ):  # for three seconds from now on
             cluster.remove_node(second, allow_graceful=False)
             removed = True
 

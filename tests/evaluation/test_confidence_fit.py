@@ -7,7 +7,7 @@ import pytest
 from scipy.special import expit
 
 from tracking3d_bench.evaluation.calibration import area_under_roc, expected_calibration_error
-from tracking3d_bench.evaluation.confidence_fit import as_python_source, fit_confidence, halves
+from tracking3d_bench.evaluation.confidence_fit import as_logistic_model, fit_confidence, halves
 
 
 def made(count, seed=0):
@@ -80,15 +80,13 @@ def test_a_larger_penalty_gives_smaller_coefficients():
     assert weights[0] > weights[1] > weights[2]
 
 
-def test_the_pasted_table_is_python_and_says_the_same():
-    evidence, right = made(1000)
+def test_the_table_as_a_file_says_the_same():
+    evidence, right = made(200)
     fit = fit_confidence(evidence, right)
-    names: dict = {}
-    exec(as_python_source(fit), names)
-    odds = names["INTERCEPT"]
-    for name, (weight, low, high, _) in names["TERMS"].items():
-        odds = odds + weight * np.clip(evidence[name], low, high)
-    assert expit(odds) == pytest.approx(fit(evidence), abs=0.005)
+    model = as_logistic_model(fit, "made", "none")
+    said = [model.probability({name: values[n] for name, values in evidence.items()}) for n in range(200)]
+    assert said == pytest.approx(fit(evidence), abs=1e-12)
+    assert (model.data, model.error) == ("made", "none")
 
 
 @pytest.mark.parametrize("right", [np.ones(5, bool), np.zeros(5, bool)])

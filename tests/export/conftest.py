@@ -80,7 +80,7 @@ def write_run(folder: Path, camera: Camera, lenses: Mapping[int, Camera] | None 
         Image.fromarray(picture).save(video / f"{index:03d}.png")
     (video / f"{SKIPPED:03d}.png").write_bytes(b"no picture")
     given = {"first_frame": 0, "first_image_crc": checksum(pictures[0])}
-    header = RunHeader(config={}, camera=camera, source=str(video), seed=0, fps=FPS, command="", given=given)
+    header = RunHeader(config={}, camera=camera, source=str(video), seed=0, fps=FPS, command="", prompt=given)
     with RunWriter(folder / "run", header) as writer:
         for index, picture in enumerate(pictures):
             if index == SKIPPED:

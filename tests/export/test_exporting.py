@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import FREE_ROTATION
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporting import export_run
-from tracking3d.export.formats import FORMATS
+from tracking3d.export.formats import FORMATS, Exporter
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.run_reader import RunReader
 
@@ -113,13 +112,13 @@ def test_an_export_that_fails_leaves_what_was_there(run, tmp_path, monkeypatch, 
     place = tmp_path / "out"
     if earlier:
         export_run(run, to, place)
-    write = FORMATS[to].write
+    write = Exporter.write
 
-    def fail(exported, path):
-        write(exported, path)
+    def fail(exporter, exported, path):
+        write(exporter, exported, path)
         raise InputError("half of it is there")
 
-    monkeypatch.setitem(FORMATS, to, replace(FORMATS[to], write=fail))
+    monkeypatch.setattr(Exporter, "write", fail)
     with pytest.raises(InputError, match="half of it"):
         export_run(run, to, place, overwrite=True)
     assert names(tmp_path) == (["out"] if earlier else [])
@@ -158,11 +157,7 @@ def test_files_of_the_run_are_not_replaced(run):
 def test_an_earlier_export_survives_where_the_new_one_cannot_be_put_in_place(run, tmp_path, monkeypatch):
     export_run(run, "kitti", tmp_path / "out")
     before = (tmp_path / "out" / "poses.txt").read_bytes()
-
-    def write_nothing(exported, path):
-        pass
-
-    monkeypatch.setitem(FORMATS, "kitti", replace(FORMATS["kitti"], write=write_nothing))
+    monkeypatch.setattr(Exporter, "write", lambda exporter, exported, path: None)
     with pytest.raises(OutputError, match="cannot be written"):
         export_run(run, "kitti", tmp_path / "out", overwrite=True)
     assert (tmp_path / "out" / "poses.txt").read_bytes() == before
@@ -172,13 +167,13 @@ def test_an_earlier_export_survives_where_the_new_one_cannot_be_put_in_place(run
 def test_every_format_is_listed_by_its_name_with_options_that_there_are():
     for name, exporter in FORMATS.items():
         assert exporter.name == name
-        assert bool(exporter.modules) == bool(exporter.extra)
+        assert bool(exporter.module) == bool(exporter.extra)
         assert exporter.options <= set(ExportOptions.__dataclass_fields__)
 
 
-@pytest.mark.parametrize("to", [name for name, exporter in FORMATS.items() if exporter.modules])
+@pytest.mark.parametrize("to", [name for name, exporter in FORMATS.items() if exporter.module])
 def test_without_its_extra_a_format_says_what_to_install(run, tmp_path, monkeypatch, to):
-    (module,) = FORMATS[to].modules
+    module = FORMATS[to].module
     monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
     with pytest.raises(InputError, match=rf"needs {module}.*pip install 'tracking3d\[{FORMATS[to].extra}\]'"):
         export_run(run, to, tmp_path / "out")

@@ -14,7 +14,7 @@ from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.ui.picker.correction import command_of, save_outcome
-from tracking3d.ui.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse_object, read_drawing
+from tracking3d.ui.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse
 from tracking3d.ui.picker.session import Picked, drawn_mask
 
 OBJECT = {"name": "cup", "colour": "#00a5e0", "frame": 0}
@@ -98,22 +98,23 @@ def test_a_picture_of_one_colour_and_points_far_outside_end_nothing():
 )
 def test_what_is_no_drawing_is_refused_in_a_sentence(fault):
     with pytest.raises(InputError, match="cannot be used"):
-        parse_object(json.dumps({**OBJECT, **fault}).encode())
+        parse(json.dumps({**OBJECT, **fault}).encode(), DrawnObject)
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[]", b"null", b"\xff", b'{"objects": []}', b"[" * 100_000])
 def test_nonsense_is_refused_in_a_sentence(text):
     with pytest.raises(InputError):
-        read_drawing(text)
+        parse(text, Drawing)
     with pytest.raises(InputError):
-        read_drawing(json.dumps({"objects": [OBJECT] * 17}).encode())
+        parse(json.dumps({"objects": [OBJECT] * 17}).encode(), Drawing)
 
 
 def test_numbers_that_are_none_are_refused():
     for number in ("NaN", "Infinity", "1e999"):
         with pytest.raises(InputError):
-            parse_object(
-                f'{{"name": "a", "colour": "#000000", "frame": 0, "box": [{number}, 1, 1, 1]}}'.encode()
+            parse(
+                f'{{"name": "a", "colour": "#000000", "frame": 0, "box": [{number}, 1, 1, 1]}}'.encode(),
+                DrawnObject,
             )
 
 
@@ -161,4 +162,4 @@ def test_the_run_is_of_all_that_was_asked_for_both_ways_from_what_was_picked(tmp
 
 def test_a_drawing_keeps_the_order_of_its_objects():
     drawing = Drawing(objects=(drawn(name="a"), drawn(name="b")))
-    assert [one.name for one in read_drawing(drawing.model_dump_json().encode()).objects] == ["a", "b"]
+    assert [one.name for one in parse(drawing.model_dump_json().encode(), Drawing).objects] == ["a", "b"]

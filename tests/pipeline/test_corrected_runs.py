@@ -32,7 +32,7 @@ FRAMES, CORRECTED = 8, 6
 
 @pytest.fixture(autouse=True)
 def every_frame(monkeypatch, stand_in_solver):
-    """Milestones of every frame, and a solver that answers at once."""
+    """Rollback points of every frame, and a solver that answers at once."""
     monkeypatch.setattr(folder, "_FIRST_GAP", 1)
 
 
@@ -242,25 +242,25 @@ def test_two_corrections_at_a_time_are_refused(clip, images, tmp_path):
     assert RunReader(tmp_path / "run").state == "finished"
 
 
-def test_milestones_are_few_and_evenly_spread(clip, images, tmp_path):
+def test_rollback_points_are_few_and_evenly_spread(clip, images, tmp_path):
     run(clip, images, tmp_path / "run", "runtime.rollback_points=3")
     state = tmp_path / "run" / layout.STATE
-    assert [one.taken for one in folder.milestones_in(state)] == [4, 8]
+    assert [one.taken for one in folder.rollback_points_in(state)] == [4, 8]
     run(clip, images, tmp_path / "none", "runtime.rollback_points=0")
     assert not (tmp_path / "none" / layout.STATE).exists()
 
 
-def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
+def test_nothing_is_kept_that_no_rollback_point_needs(clip, images, tmp_path):
     run(clip, images, tmp_path / "run", "runtime.rollback_points=2")
     state = tmp_path / "run" / layout.STATE
-    kept = folder.milestones_in(state)
+    kept = folder.rollback_points_in(state)
     assert 1 <= len(kept) <= 2
     named = {name for one in kept for name in one.arrays}
     assert {path.name for path in state.glob("*.npz")} == named
 
 
 @pytest.mark.slow
-def test_milestones_that_are_too_large_go(clip, images, tmp_path, monkeypatch, caplog, stepped):
+def test_rollback_points_that_are_too_large_go(clip, images, tmp_path, monkeypatch, caplog, stepped):
     monkeypatch.setattr(checkpoint_folder, "MOST_KEPT", 0)
     run(clip, images, tmp_path / "run")
     assert not (tmp_path / "run" / layout.STATE).exists()
@@ -272,7 +272,7 @@ def test_milestones_that_are_too_large_go(clip, images, tmp_path, monkeypatch, c
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
-def test_no_milestone_stands_between_a_frame_and_what_revised_it(clip, images, tmp_path, monkeypatch):
+def test_no_rollback_point_stands_between_a_frame_and_what_revised_it(clip, images, tmp_path, monkeypatch):
     step = CausalSolver.step
 
     def revising(self, state, frame, mask):
@@ -283,13 +283,13 @@ def test_no_milestone_stands_between_a_frame_and_what_revised_it(clip, images, t
 
     monkeypatch.setattr(CausalSolver, "step", revising)
     run(clip, images, tmp_path / "run")
-    kept = folder.milestones_in(tmp_path / "run" / layout.STATE)
+    kept = folder.rollback_points_in(tmp_path / "run" / layout.STATE)
     assert [one.taken for one in kept] == [1, 2, 6, 7, 8]
 
 
-def test_a_damaged_milestone_is_passed_over(clip, images, tmp_path, stepped):
+def test_a_damaged_rollback_point_is_passed_over(clip, images, tmp_path, stepped):
     run(clip, images, tmp_path / "run")
-    kept = folder.milestones_in(tmp_path / "run" / layout.STATE)
+    kept = folder.rollback_points_in(tmp_path / "run" / layout.STATE)
     kept[5].path.write_text("{")
     stepped.clear()
     correct_run(tmp_path / "run", told(clip))

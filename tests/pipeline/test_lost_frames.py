@@ -159,7 +159,8 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
 
 def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
     monkeypatch.setattr(Session, "tried", FRAMES - 2)
-    lose(monkeypatch, {12, 13, 14, 15})
+    monkeypatch.setattr(lost_frames, "find_start", lambda *_: pytest.fail("no frames are left for it"))
+    lose(monkeypatch, {9, 10, 11, 12, 13, 14, 15})
     tried = run(video, tmp_path / "run").description["refinement"]["start"]["tried"]
     assert tried == {"while tracking": FRAMES - 2, "gaps": 2}
 

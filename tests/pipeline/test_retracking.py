@@ -10,13 +10,13 @@ import pytest
 from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d import Status, load_config
-from tracking3d.cli.summary import passes_in_words
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.refinement_steps import RefinementSteps
 from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.ui.sentences import passes_in_words
 from tracking3d.video import open_source
 
 FRAMES, DOUBTFUL, MOVED = 8, 3, 6

@@ -22,7 +22,8 @@ needs_proc = pytest.mark.skipif(
 
 
 PEAKS = """
-from tracking3d.runtime.memory import forget_peak, resident_memory
+from tracking3d.runtime.memory import resident_memory
+from tracking3d_bench.speed.memory import forget_peak
 forget_peak()
 now, _ = resident_memory()
 block = b"x" * int(64e6)

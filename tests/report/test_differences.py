@@ -144,8 +144,8 @@ def test_what_cannot_be_of_one_video_is_refused(run_of, tmp_path):
 
 def test_doubts_about_the_comparison_are_said(run_of, clip):
     first = {"frames": 12, "first_frame": 0, "first_image_crc": 1}
-    a = run_of("a", given=first)
-    b = run_of("b", given=first | {"first_image_crc": 2}, camera=Camera.from_fov(160, 120, 20))
+    a = run_of("a", prompt=first)
+    b = run_of("b", prompt=first | {"first_image_crc": 2}, camera=Camera.from_fov(160, 120, 20))
     run = json.loads((b / "run.json").read_text())
     (b / "run.json").write_text(json.dumps(run | {"state": "interrupted"}))
     told = " ".join(compare_runs([a, b]).notes)

@@ -22,9 +22,9 @@ from tracking3d.results.files import write_probability
 from tracking3d.results.layout import runs_in
 from tracking3d.results.run_reader import RunReader
 from tracking3d.ui.report import run_report
-from tracking3d.ui.report.doubts import doubts_of
 from tracking3d.ui.report.run_report import probability_layers, write_report
 from tracking3d.ui.report.several import write_reports
+from tracking3d.ui.sentences import doubts_of
 from tracking3d.video import open_source
 
 
@@ -255,7 +255,7 @@ def test_the_report_gives_the_command_for_what_to_do_next(
     change_records(run_folder, {"status": "tracked", "iou_initial": 0.95, "area": 900} | changes)
     (run_folder / layout.STATE).mkdir()
     (run_folder / layout.STATE / layout.STATE_FILE).write_text("{}")
-    monkeypatch.setattr("tracking3d.ui.report.doubts.unseen_share", lambda _: about.get("unseen", 0.2))
+    monkeypatch.setattr("tracking3d.ui.sentences.unseen_share", lambda _: about.get("unseen", 0.2))
     described(
         run_folder,
         camera=RunReader(run_folder).description["camera"]

@@ -6,8 +6,8 @@ import pytest
 from recorded_runs import estimate_of
 
 from tracking3d.estimation.estimate import Status
-from tracking3d.results.notes import DoubtfulRange, doubtful_ranges
 from tracking3d.results.records import FrameRecord
+from tracking3d.ui.sentences import DoubtfulRange, doubtful_ranges
 
 
 def record(index: int, status: Status, reason: str = "") -> FrameRecord:

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from tracking3d.cli.summary import advise_networks, print_summary
+from tracking3d.cli.summary import print_summary
 from tracking3d.estimation.estimate import MaskSource, lost_estimate
 from tracking3d.features.networks.catalogue import recommended_networks
 from tracking3d.frames import Frame, MaskEstimate
@@ -16,6 +16,7 @@ from tracking3d.results.contact_sheet import CROPS, TILE
 from tracking3d.results.notes import describe_camera_and_model, notes_of_run, notes_of_times, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.runtime.stage_times import STAGES, StageTimes
+from tracking3d.ui.sentences import advise_networks
 from tracking3d.video.image_file import read_image
 
 pytestmark = pytest.mark.usefixtures("as_users_see_it")

@@ -129,6 +129,20 @@ def test_only_masks_that_something_contradicts_are_decided_where_masks_may_be_ke
     assert {index for index, decided in found.items() if decided is not None} == {0, 2, 3}
 
 
+def test_frames_whose_poses_are_doubted_are_not_decided():
+    doubted = range(9, 30)
+    frames = [answered(number % 12, index=number) for number in range(30)]
+    frames = [replace(one, confidence=0.4) if one.index in doubted else one for one in frames]
+    known = VideoSegmenter(CAMERA, VERTICES, FACES, {one.index: one.confidence for one in frames})
+    for one in frames:
+        known.see(one)
+    known.settle()
+    assert known.kept == set(doubted)
+    assert [index for index in range(30) if known.needs(index)] == list(range(17))  # eight tell the motion
+    found = dict(segmented(known, frames))
+    assert {index for index, decided in found.items() if decided is None} == set(doubted)
+
+
 def test_frames_far_from_all_that_are_decided_are_not_needed():
     frames = [answered(number % 12, index=number) for number in range(30)]
     known = VideoSegmenter(

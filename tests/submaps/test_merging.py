@@ -29,7 +29,7 @@ from tracking3d.pipeline.submaps.alignment import (
     check_agreement,
     common_poses,
     fit_similarity,
-    in_space,
+    reproject_features,
     through_lens,
 )
 from tracking3d.pipeline.submaps.merge_step import merge_submap_states
@@ -147,9 +147,11 @@ def test_features_are_those_of_the_first_part_s_space(solved):
     state = solved[0]
     space, encoder = state.feature_space, build_encoder(settings())
     other = replace(space, mean=space.mean + 0.1, components=space.components.flip(0) * 1.5)
-    there = in_space(state.object_map, space, other, encoder)
-    exact = in_space(there, other, space, encoder)
-    encoded = in_space(there, None, space, encoder)  # as where a space does not keep all that was encoded
+    there = reproject_features(state.object_map, space, other, encoder)
+    exact = reproject_features(there, other, space, encoder)
+    encoded = reproject_features(
+        there, None, space, encoder
+    )  # as where a space does not keep all that was encoded
     for view, same, again, moved_view in zip(
         exact.keyframes, state.object_map.keyframes, encoded.keyframes, there.keyframes, strict=True
     ):
@@ -164,8 +166,8 @@ def test_features_are_those_of_the_first_part_s_space(solved):
 def test_a_map_with_the_contrast_and_one_without_get_the_features_of_the_other_s_space(solved):
     state = solved[0]
     space, encoder = state.feature_space, build_encoder(settings())
-    plain = in_space(state.object_map, space, space.with_contrast(), encoder)
-    back = in_space(plain, space.with_contrast(), space, encoder)
+    plain = reproject_features(state.object_map, space, space.with_contrast(), encoder)
+    back = reproject_features(plain, space.with_contrast(), space, encoder)
     for view, marked, same in zip(back.keyframes, plain.keyframes, state.object_map.keyframes, strict=True):
         seen = same.observation
         torch.testing.assert_close(view.observation.features, seen.features, atol=1e-4, rtol=0)

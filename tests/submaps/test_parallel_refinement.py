@@ -16,7 +16,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.pipeline.record import record
 from tracking3d.pipeline.submaps.job import LongVideo
 from tracking3d.pipeline.submaps.merge_step import MergedSubmaps
-from tracking3d.pipeline.submaps.plan import Begun, Plan
+from tracking3d.pipeline.submaps.plan import Plan, PlannedVideo
 from tracking3d.pipeline.submaps.split_run import Step, steps_to_the_end
 from tracking3d.pipeline.submaps.submap_runs import Revisit
 from tracking3d.results import layout
@@ -71,12 +71,14 @@ def looked_at_again(frames: Path, config: PipelineConfig, folder: Path) -> Path:
 def ended_in_parts(frames: Path, config: PipelineConfig, folder: Path, cut: int) -> list[list[Step]]:
     """Go on with such a run in two parts; the steps that were taken, side by side."""
     video = LongVideo(str(frames), config, folder, PromptSet(), "9f")
-    begun = Begun(video, config, None, FRAMES, Plan([]), ())
-    looks = tuple(
+    planned = PlannedVideo(video, config, None, FRAMES, Plan([]), ())
+    revisits = tuple(
         Revisit(str(frames), None, selection, config, folder, PromptSet(), folder / "not needed any more")
         for selection in (f"0:{cut}:1", f"{cut}:{FRAMES}:1")
     )
-    return taken(steps_to_the_end(MergedSubmaps(begun, looks, {}, {"refine": 1.0, "refinement_pass": 1.0})))
+    return taken(
+        steps_to_the_end(MergedSubmaps(planned, revisits, {}, {"refine": 1.0, "refinement_pass": 1.0}))
+    )
 
 
 def taken(steps: Generator[list[Step], list[Any], Any]) -> list[list[Step]]:

@@ -151,7 +151,7 @@ def clip() -> SyntheticClip:
 
 
 def files_of(folder: Path) -> set[Path]:
-    """What a run is read from; milestones for corrections are of the run that made them."""
+    """What a run is read from; rollback points for corrections are of the run that made them."""
     found = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
     return {path for path in found if path.parts[0] != layout.STATE}
 

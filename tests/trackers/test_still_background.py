@@ -93,6 +93,19 @@ def test_what_has_come_before_the_background_is_the_object_unless_it_is_an_occlu
     assert share < 0.1 if in_front else share > 0.6
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_large_side_that_comes_at_once_is_believed_before_a_camera_that_stands_still(moves: bool):
+    frames, truth = moving_shape(8)
+    if moves:
+        frames = [replace(one, image=np.roll(one.image, 2 * n, axis=0)) for n, one in enumerate(frames)]
+        truth = [np.roll(one, 2 * n, axis=0) for n, one in enumerate(truth)]
+    side = np.roll(truth[-1], truth[-1].any(0).sum() // 2, axis=1) & ~truth[-1]
+    frames[-1].image[side] = (0, 255, 0)
+    mask = last_mask(frames, truth, lambda mask: (np.where(mask, 1, -0.5), np.full(mask.shape, -1)))
+    taken = (mask & side).sum() / side.sum()
+    assert taken < 0.1 if moves else taken > 0.8
+
+
 def test_a_mask_that_shows_nothing_but_background_is_given_up(monkeypatch):
     frames, truth = moving_shape(2)
     nothing_new = lambda self, image, window: np.full((window.size, window.size), -0.5, np.float32)  # noqa: E731

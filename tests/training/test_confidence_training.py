@@ -1,4 +1,4 @@
-"""The script that fits the confidence reads finished runs, never mixes the halves, and prints what can be pasted."""
+"""The script that fits the confidence reads finished runs, never mixes the halves, and prints the package's table."""
 
 from __future__ import annotations
 
@@ -95,8 +95,10 @@ def test_the_fit_is_tested_on_the_other_half_and_printed(script, benchmark, tmp_
     file = tmp_path / "coefficients.json"
     script.main([str(benchmark), "--evidence=-silhouette,+has_mask", "--json", str(file)])
     told = capsys.readouterr().out
-    assert told.count("fitted on 2 sequences, 22 frames") == 2 and "INTERCEPT = " in told
-    terms = {one["name"]: one for one in json.loads(file.read_text())["half"]["terms"]}
+    assert told.count("fitted on 2 sequences, 22 frames") == 2 and '"intercept": ' in told
+    table = json.loads(file.read_text())
+    assert table["data"] == "44 frames of 4 sequences" and table["error"].count("calibration error") == 2
+    terms = table["terms"]
     assert terms["silhouette"]["weight"] < -2 and terms["has_mask"]["weight"] == 0
     recorded, fitted = _errors(told)
     assert fitted < recorded
@@ -124,8 +126,8 @@ def test_with_balance_every_folder_is_tested_by_a_fit_on_the_others(script, benc
         [str(benchmark), str(other), "--balance", "--evidence=-silhouette,recorded_odds", "--json", str(file)]
     )
     told = capsys.readouterr().out
-    assert [line.split(":")[0] for line in told.splitlines() if "frames" in line] == ["other", "out"]
-    terms = {one["name"]: one for one in json.loads(file.read_text())["all"]["terms"]}
+    assert [line.split(":")[0] for line in told.splitlines() if " frames, " in line] == ["other", "out"]
+    terms = json.loads(file.read_text())["terms"]
     assert terms["silhouette"]["weight"] < -2 and terms["recorded_odds"]["weight"] == 0  # it never differs
     with pytest.raises(InputError, match="At least two folders"):
         script.main([str(benchmark), "--balance", "--evidence=silhouette"])

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System, _damp
+from tracking3d.geometry.levenberg_marquardt import damped
+from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System
 from tracking3d.points.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
@@ -18,7 +19,7 @@ from twins.reprojection import pixel_by_point, pixel_by_pose
 
 def step(system: System, damping: float) -> tuple[FloatArray, FloatArray] | None:
     """See `System.step`."""
-    poses, points = _damp(system.poses, damping), _damp(system.points, damping)
+    poses, points = damped(system.poses, damping), damped(system.points, damping)
     flat = system.coupling.reshape(3 * len(points), len(poses))
     by_points = (np.linalg.inv(points) @ system.coupling).reshape(flat.shape)
     gradient = system.poses_gradient - by_points.T @ system.points_gradient.ravel()

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tracking3d.estimation.online.optimization.pnp import _shares
-from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
-from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
-from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_DAMPING
 from tracking3d.points.bundle_adjustment.reprojection import (
     BEHIND,
+    EvaluatedPose,
     FloatArray,
     apply_pose_steps,
     finite_rows,
@@ -28,26 +27,26 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int = 10,
-) -> PnPFit:
+) -> EvaluatedPose:
     """See `tracking3d.estimation.online.optimization.pnp.pose_of_tracks`."""
     at = point_equations(points, pixels, weight, K, R, t, scale)
-    damping = FIRST_DAMPING
+    damping = PNP_DAMPING.first
     for _ in range(iterations):
         diagonal = at.matrix.diagonal()
         floor = 1e-9 * diagonal.max() + 1e-12
         step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
         R_new, t_new = (
-            part[0] for part in apply_pose_steps(R[None], t[None], np.asarray(step[None], np.float64))
+            part[0] for part in apply_pose_steps(at.R[None], at.t[None], np.asarray(step[None], np.float64))
         )
         new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
         if not new.cost < at.cost:
-            damping = min(10 * damping, MOST_DAMPING)
+            damping = 10 * damping
             continue
-        settled = at.cost - new.cost < CONVERGED * at.cost
-        R, t, at, damping = R_new, t_new, new, damping / 10
+        settled = at.cost - new.cost < PNP_DAMPING.converged * at.cost
+        at, damping = new, damping / 10
         if settled:
             break
-    return PnPFit(R, t, at)
+    return at
 
 
 def point_equations(
@@ -58,7 +57,7 @@ def point_equations(
     R: FloatArray,
     t: FloatArray,
     scale: float,
-) -> PointEquations:
+) -> EvaluatedPose:
     """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
     share = _shares(points, pixels, weight)
     x_cam = transform_to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
@@ -73,4 +72,4 @@ def point_equations(
     motion = pixel_by_pose(pixel_by_point(x_cam, K), x_cam - t)
     rows = motion.reshape(-1, 6)
     weighted = (robust[:, None, None] * motion).reshape(-1, 6)
-    return PointEquations(rows.T @ weighted, weighted.T @ difference.ravel(), cost, residual)
+    return EvaluatedPose(cost, R, t, residual, rows.T @ weighted, weighted.T @ difference.ravel())

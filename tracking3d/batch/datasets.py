@@ -19,30 +19,11 @@ DATASET_READERS = "tracking3d.dataset_readers"
 class DatasetSequence(Protocol):
     """What a tracker is given of a sequence."""
 
-    @property
-    def frames(self) -> tuple[Path, ...]:
-        """The images."""
-        ...
-
-    @property
-    def box(self) -> Box | None:
-        """The object in the first of them, if it is known."""
-        ...
-
-    @property
-    def given_camera(self) -> Camera | None:
-        """The camera that a tracker is given, if that is not the true one."""
-        ...
-
-    @property
-    def camera(self) -> Camera | None:
-        """The true camera."""
-        ...
-
-    @property
-    def camera_told(self) -> bool:
-        """Whether a tracker is given a camera at all."""
-        ...
+    frames: tuple[Path, ...]  # the images
+    box: Box | None  # the object in the first of them, if it is known
+    given_camera: Camera | None  # the camera that a tracker is given, if that is not the true one
+    camera: Camera | None  # the true camera
+    camera_told: bool  # whether a tracker is given a camera at all
 
     def box_in_frame(self) -> Box | None:
         """The part of `box` inside the first frame."""
@@ -52,20 +33,9 @@ class DatasetSequence(Protocol):
 class Dataset(Protocol):
     """Sequences in a folder."""
 
-    @property
-    def layout(self) -> str:
-        """Name of the layout, or the YAML file of one."""
-        ...
-
-    @property
-    def root(self) -> Path:
-        """The folder."""
-        ...
-
-    @property
-    def sequences(self) -> tuple[str, ...]:
-        """Names of the sequences."""
-        ...
+    layout: str  # name of the layout, or the YAML file of one
+    root: Path  # the folder
+    sequences: tuple[str, ...]  # their names
 
 
 class DatasetReader(Protocol):

@@ -114,14 +114,7 @@ def read_failures(out: str) -> list[Failure]:
     content = read(join_path(out, FAILURES)) or b""
     try:
         return [
-            Failure(
-                row["run"],
-                row["video"],
-                row["reason"],
-                int(row["attempts"]),
-                row["crashed"] == "True",
-                row["log"],
-            )
+            Failure(**row | {"attempts": int(row["attempts"]), "crashed": row["crashed"] == "True"})
             for row in csv.DictReader(io.StringIO(content.decode("utf-8")), strict=True)
         ]
     except (ValueError, KeyError, TypeError, csv.Error) as error:

@@ -18,7 +18,7 @@ from tracking3d.batch.storage import absolute, copy_to_local, join_path, local, 
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import SharedNetwork, VideoJob, keep_networks
 from tracking3d.config.models import PipelineConfig
-from tracking3d.engines.protocol import Tell
+from tracking3d.engines.protocol import Reporter
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
@@ -65,7 +65,7 @@ def log_file(out: str, job: VideoJob) -> Path:
 
 
 def track_video(
-    tell: Tell,
+    tell: Reporter,
     job: VideoJob,
     out: str,
     command: str,
@@ -148,7 +148,7 @@ def put_away(
     return marker
 
 
-def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
+def _track(tell: Reporter, job: VideoJob, run: Path, command: str) -> None:
     # Not before: the process that hands out the videos need not wait for what tracks.
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import RecordOptions, record_tracking
@@ -166,7 +166,7 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     record_tracking(request, run, RecordOptions(command, job.frames, resume=True), listener)
 
 
-def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
+def counting(tell: Reporter, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
     """A listener that reports the number of estimates from time to time, at first zero."""
     done, last, process = 0, 0.0, os.getpid()
 
@@ -181,7 +181,7 @@ def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord 
     return listener
 
 
-def telling_stages(tell: Tell) -> ProgressListener:
+def telling_stages(tell: Reporter) -> ProgressListener:
     """A listener that reports the name of each stage when it begins."""
     present = ""
 

@@ -17,7 +17,7 @@ from tracking3d.batch.summary import MARKER, read_marker
 from tracking3d.batch.tasks import Tasks, is_finished_video
 from tracking3d.batch.video_job import VideoJob, share_networks
 from tracking3d.engines.mapping import PAUSE, map_tasks
-from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
+from tracking3d.engines.protocol import Began, Ended, Engine, Event, ProgressReport, Task
 from tracking3d.errors import OutputError
 from tracking3d.results import layout
 from tracking3d.results.files import try_lock, writing
@@ -32,7 +32,7 @@ _PATIENCE = 20.0  # a file that takes long to write is written less often: so ma
 
 
 @dataclass(frozen=True)
-class Happening:
+class BatchEvent:
     """Something that a scheduler or a person may want to know."""
 
     event: str  # began, progress, again, finished or failed of a video; batch of all
@@ -41,7 +41,7 @@ class Happening:
     progress: BatchProgress  # how far the batch is
 
 
-Listener = Callable[[Happening], None]
+Listener = Callable[[BatchEvent], None]
 
 
 class Batch:
@@ -115,7 +115,7 @@ class Batch:
                 about["step"] = label
             self._running[event.worker] = {"video": job.name, "since": time.time(), **about}
             self._say("began", job, {"worker": event.worker, **about})
-        elif isinstance(event, Told):
+        elif isinstance(event, ProgressReport):
             worker = self._workers.get(event.number, "")
             if worker in self._running:
                 self._running[worker].update(event.content)
@@ -163,7 +163,7 @@ class Batch:
 
     def say_all(self) -> None:
         """Report the progress of the batch to the listener."""
-        self._listener(Happening("batch", "", {}, self.progress))
+        self._listener(BatchEvent("batch", "", {}, self.progress))
 
     def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
         """Why a video's run folder cannot be had, in a sentence; empty if it can, or is there already."""
@@ -227,7 +227,7 @@ class Batch:
         )
 
     def _say(self, event: str, job: VideoJob, about: Mapping[str, Any]) -> None:
-        self._listener(Happening(event, job.name, about, self.progress))
+        self._listener(BatchEvent(event, job.name, about, self.progress))
 
 
 def _share(running: Mapping[str, Any]) -> float:

@@ -20,9 +20,9 @@ from tracking3d.batch.one_video import (
     track_video,
 )
 from tracking3d.batch.video_job import SharedNetwork, VideoJob
-from tracking3d.engines.protocol import Ended, Task, Tell
+from tracking3d.engines.protocol import Ended, Reporter, Task
 from tracking3d.pipeline.submaps.job import LongVideo, SplitResult
-from tracking3d.pipeline.submaps.plan import Begun, begin
+from tracking3d.pipeline.submaps.plan import PlannedVideo, plan_video
 from tracking3d.pipeline.submaps.split_run import Step, Steps, steps_of
 from tracking3d.trackers.prompts.boxes import parse_box
 from tracking3d.trackers.prompts.points import parse_points
@@ -130,14 +130,14 @@ def is_finished_video(ended: Ended) -> bool:
 
 
 def begin_in_parts(
-    tell: Tell,
+    tell: Reporter,
     job: VideoJob,
     out: str,
     command: str,
     report: bool,
     workers: int,
     networks: tuple[SharedNetwork, ...] = (),
-) -> Begun | dict[str, Any]:
+) -> PlannedVideo | dict[str, Any]:
     """Cut a video; a video that is a single submap is tracked here, and the result is that of `put_away`.
 
     Args:
@@ -154,16 +154,16 @@ def begin_in_parts(
     """
     with local_work_folder(job, out, networks) as work:
         attempts = count_attempt(work)
-        begun = begin(
+        planned = plan_video(
             counting(tell, None), _video(fetch_inputs(job, work / "source"), work, command, workers)
         )
-        if isinstance(begun, SplitResult):
-            return put_away(job, out, work, begun.folders, report, attempts, _note(begun))
-        return begun
+        if isinstance(planned, SplitResult):
+            return put_away(job, out, work, planned.folders, report, attempts, _note(planned))
+        return planned
 
 
 def step_in_parts(
-    tell: Tell, job: VideoJob, out: str, step: Step, whole: int, networks: tuple[SharedNetwork, ...] = ()
+    tell: Reporter, job: VideoJob, out: str, step: Step, whole: int, networks: tuple[SharedNetwork, ...] = ()
 ) -> Any:
     """Do one step and return its result.
 
@@ -187,7 +187,7 @@ def step_in_parts(
 
 
 def settle_in_parts(
-    tell: Tell, job: VideoJob, out: str, report: bool, ended: SplitResult, again: int
+    tell: Reporter, job: VideoJob, out: str, report: bool, ended: SplitResult, again: int
 ) -> dict[str, Any]:
     """Put what became of a video into its place.
 
@@ -215,15 +215,7 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
         box_format=job.box_format,
     )
     return LongVideo(
-        job.video,
-        job.config,
-        work / RUN,
-        prompts,
-        job.split,
-        workers,
-        job.frames,
-        command,
-        resume=True,
+        job.video, job.config, work / RUN, prompts, job.split, workers, job.frames, command, resume=True
     )
 
 

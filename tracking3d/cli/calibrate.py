@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug, Quiet
 from tracking3d.cli.options.general import VIDEO
+from tracking3d.cli.program import WithDefault
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -25,19 +25,8 @@ _MARGIN = 0.2
 _MILLIMETRES_AN_INCH = 25.4
 
 
-class _VideoFirst(TyperGroup):
-    """A group whose command ``video`` need not be named."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert ``video`` if the first word names no command, also if it is an option."""
-        return list(super().parse_args(ctx, self._name_of(args)))
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command and its arguments."""
-        return super().resolve_command(ctx, self._name_of(args))
-
-    def _name_of(self, args: list[str]) -> list[str]:
-        return ["video", *args] if args and args[0] not in (*self.commands, "--help") else args
+class _VideoFirst(WithDefault):
+    default = "video"
 
 
 app = typer.Typer(

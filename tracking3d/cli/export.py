@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -17,20 +17,17 @@ if TYPE_CHECKING:
     from tracking3d.export.exporting import Export
     from tracking3d.export.options import ExportOptions
 
-_CONTENT = "Content"
-
 
 @dataclass(frozen=True)
 class ContentOptions:
     """What of a run is exported."""
 
+    PANEL: ClassVar = "Content"
+
     estimates: Annotated[
         str,
         typer.Option(
-            "--answers",
-            metavar="causal|final",
-            help="Estimates before or after the final refinement.",
-            rich_help_panel=_CONTENT,
+            "--answers", metavar="causal|final", help="Estimates before or after the final refinement."
         ),
     ] = "final"
     object_size: ObjectSize = None
@@ -39,54 +36,37 @@ class ContentOptions:
         typer.Option(
             metavar="object|camera",
             help="Poses to export: of the object in the camera, or of the camera around the object.",
-            rich_help_panel=_CONTENT,
         ),
     ] = "object"
     cut_out: Annotated[
         bool,
-        typer.Option(
-            "--cut-out",
-            help="Write images as PNG with a transparent background.",
-            rich_help_panel=_CONTENT,
-        ),
+        typer.Option("--cut-out", help="Write images as PNG with a transparent background."),
     ] = False
     unseen: Annotated[
         str,
         typer.Option(
-            metavar="close|cut",
-            help="Surface that no frame has shown: keep it, marked, or leave it out.",
-            rich_help_panel=_CONTENT,
+            metavar="close|cut", help="Surface that no frame has shown: keep it, marked, or leave it out."
         ),
     ] = "close"
     images: Annotated[
         bool,
-        typer.Option("--images/--no-images", help="Write the images too.", rich_help_panel=_CONTENT),
+        typer.Option("--images/--no-images", help="Write the images too."),
     ] = True
     undistorted: Annotated[
         bool,
-        typer.Option(
-            "--undistorted",
-            help="Remove lens distortion from masks, as poses and cameras assume.",
-            rich_help_panel=_CONTENT,
-        ),
+        typer.Option("--undistorted", help="Remove lens distortion from masks, as poses and cameras assume."),
     ] = False
     compressed_images: Annotated[
         bool,
-        typer.Option(
-            "--compressed-images", help="Include the frames of the video as JPEG.", rich_help_panel=_CONTENT
-        ),
+        typer.Option("--compressed-images", help="Include the frames of the video as JPEG."),
     ] = False
     xy: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="X,Y",
-            help="Pixel on the object to track; may be repeated. Default: a grid.",
-            rich_help_panel=_CONTENT,
-        ),
+        typer.Option(metavar="X,Y", help="Pixel on the object to track; may be repeated. Default: a grid."),
     ] = None
     frame: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Frame that these pixels are in.", rich_help_panel=_CONTENT),
+        typer.Option(metavar="N", help="Frame that these pixels are in."),
     ] = None
 
 
@@ -94,17 +74,18 @@ class ContentOptions:
 class SourceOptions:
     """The video of the run."""
 
+    PANEL: ClassVar = VIDEO
+
     source: Video = None
     fps: Annotated[
         float | None,
-        typer.Option(metavar="NUMBER", help="Frame rate of the video.", rich_help_panel=VIDEO),
+        typer.Option(metavar="NUMBER", help="Frame rate of the video."),
     ] = None
     start_time: Annotated[
         str | None,
         typer.Option(
             metavar="SECONDS|DATE",
             help="Start of the video, in seconds from 1970 or as ISO 8601; default the time at which it was recorded.",
-            rich_help_panel=VIDEO,
         ),
     ] = None
 

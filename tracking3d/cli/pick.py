@@ -12,7 +12,7 @@ import typer
 from tracking3d.cli.model import check_model_source
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.general import OUTPUT
-from tracking3d.cli.options.output import Browser, Host, Overwrite, RunFolder
+from tracking3d.cli.options.output import Browser, Host, Overwrite, Port, RunFolder
 from tracking3d.cli.options.tracking import CameraOptions, Features, Frames, Tracker, TrackingOptions
 from tracking3d.cli.view import show_address
 
@@ -38,15 +38,7 @@ def pick(
     settings: SettingsOptions,
     camera: CameraOptions,
     host: Host = None,
-    port: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=65535,
-            help="Port, or the next free one above it; 0 for any free port.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = 8090,
+    port: Port = 8090,
     browser: Browser = True,
     view: Annotated[
         bool,

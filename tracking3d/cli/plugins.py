@@ -9,29 +9,25 @@ from __future__ import annotations
 import shlex
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug
 from tracking3d.cli.plugged_commands import COMMANDS, fault_of, registered_commands
+from tracking3d.cli.program import WithDefault
 
 DEFAULT = "list"
 
 
-class _Plugins(TyperGroup):
+class _Plugins(WithDefault):
     """A group that lists the plug-ins if no command is given."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, args if args[:1] == ["--help"] else _with_command(args))
+    default = DEFAULT
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        return super().resolve_command(ctx, _with_command(args))
-
-
-def _with_command(args: list[str]) -> list[str]:
-    return args if args and not args[0].startswith("-") else [DEFAULT, *args]
+    def with_command(self, args: list[str]) -> list[str]:
+        named = args[:1] == ["--help"] or (args and not args[0].startswith("-"))
+        return args if named else [DEFAULT, *args]
 
 
 app = typer.Typer(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tracking3d.results.run_reader import RunReader
     from tracking3d.video import FrameSource
 
-_QUERY = "Query"
 _RATE = 25.0  # frames per second, for images without a frame rate
 
 
@@ -28,49 +27,30 @@ _RATE = 25.0  # frames per second, for images without a frame rate
 class QueryOptions:
     """Which points are tracked, and from what."""
 
+    PANEL: ClassVar = "Query"
+
     xy: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="X,Y",
-            help="Pixel to track from the query frame; may be repeated.",
-            rich_help_panel=_QUERY,
-        ),
+        typer.Option(metavar="X,Y", help="Pixel to track from the query frame; may be repeated."),
     ] = None
     grid: Annotated[
         int | None,
         typer.Option(
-            metavar="STEP",
-            min=1,
-            help="Track a grid of pixels with this spacing over the whole object.",
-            rich_help_panel=_QUERY,
+            metavar="STEP", min=1, help="Track a grid of pixels with this spacing over the whole object."
         ),
     ] = None
-    frame: Annotated[
-        int, typer.Option(metavar="N", help="Query frame, which the pixels are in.", rich_help_panel=_QUERY)
-    ] = 0
+    frame: Annotated[int, typer.Option(metavar="N", help="Query frame, which the pixels are in.")] = 0
     any_pixel: Annotated[
         bool,
-        typer.Option(
-            "--any",
-            help="Track pixels on the background too, from the images alone.",
-            rich_help_panel=_QUERY,
-        ),
+        typer.Option("--any", help="Track pixels on the background too, from the images alone."),
     ] = False
     by_mesh: Annotated[
         bool,
-        typer.Option(
-            "--by-mesh",
-            help="Move points with mesh and pose alone; the images are not read.",
-            rich_help_panel=_QUERY,
-        ),
+        typer.Option("--by-mesh", help="Move points with mesh and pose alone; the images are not read."),
     ] = False
     causal: Annotated[
         bool,
-        typer.Option(
-            "--causal",
-            help="Start from the estimates before the final refinement.",
-            rich_help_panel=_QUERY,
-        ),
+        typer.Option("--causal", help="Start from the estimates before the final refinement."),
     ] = False
     other: Annotated[
         Path | None,
@@ -78,7 +58,6 @@ class QueryOptions:
             "--in",
             metavar="RUN",
             help="Track the points in another run of the same object, too, for example one with --object of this run.",
-            rich_help_panel=_QUERY,
         ),
     ] = None
     source: Video = None

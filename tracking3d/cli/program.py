@@ -87,6 +87,24 @@ class Program(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
 
 
+class WithDefault(TyperGroup):
+    """A group whose command ``default`` need not be named."""
+
+    default: str
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the default command if the first word names none."""
+        return list(super().parse_args(ctx, self.with_command(args)))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that the first word names, or the default one."""
+        return super().resolve_command(ctx, self.with_command(args))
+
+    def with_command(self, args: list[str]) -> list[str]:
+        """The arguments behind the name of a command."""
+        return [self.default, *args] if args and args[0] not in (*self.commands, "--help") else args
+
+
 _AT_ONCE = 5.0
 """Seconds after the first SIGTERM in which further ones are ignored."""
 

@@ -16,6 +16,7 @@ import typer
 
 from tracking3d.cli.model import check_model_source
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
+from tracking3d.cli.options.general import settings_of
 from tracking3d.cli.options.output import OutputOptions, PerformanceOptions
 from tracking3d.cli.options.prompt import PromptOptions
 from tracking3d.cli.options.tracking import CameraOptions, Source, TrackingOptions, VideoOptions
@@ -127,28 +128,13 @@ def _configure(
     performance: PerformanceOptions,
 ) -> PipelineConfig:
     """The configuration that the options make together."""
-    return settings.configure(
-        tracker=tracking.tracker_settings(prompt.masks),
-        features=tracking.features,
-        camera=camera.settings(),
-        object={
-            "model": None if prompt.extend else prompt.known,
-            "extends": str(Path(prompt.known).expanduser().absolute())
-            if prompt.extend and prompt.known
-            else None,
-            "flat": tracking.flat or None,
-            "trust_masks": tracking.trust_masks or None,
-            "prototype": tracking.prototype,
-            "size": output.object_size,
-        },
-        crop={"size": performance.size},
-        solver={"final_refine": tracking.final_refine},
-        runtime={
-            "device": performance.device,
-            "seed": tracking.seed,
-            "on_plugin_failure": tracking.on_plugin_failure,
-        },
-    )
+    given = settings_of(tracking, output, performance)
+    given |= {"tracker": tracking.tracker_settings(prompt.masks), "camera": camera.settings()}
+    if prompt.extend and prompt.known:
+        given["object"]["extends"] = str(Path(prompt.known).expanduser().absolute())
+    else:
+        given["object"]["model"] = prompt.known
+    return settings.configure(**given)
 
 
 def _configure_in_browser(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,6 +12,7 @@ from tracking3d.results import layout
 from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import STAGES
+from tracking3d.ui.sentences import advise_networks, passes_in_words
 
 _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
 
@@ -65,37 +64,3 @@ def print_summary(folder: Path) -> None:
         if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
             table.add_row(what, "\n".join(files))
     print_table(table)
-
-
-def passes_in_words(run: Mapping[str, Any]) -> str:
-    """Seconds of each pass of a run, and how many frames it left as they were; empty for runs that do not say.
-
-    Args:
-        run: Its ``run.json``.
-    """
-    over = (run.get("refinement") or {}).get("passed_over") or {}
-    return ", ".join(
-        f"{name} {seconds:.1f} s" + (f" ({over[name]} frames passed over)" if over.get(name) else "")
-        for name, seconds in run["timings"].get("passes", {}).items()
-    )
-
-
-def advise_networks(tracker: str) -> str:
-    """What the recommended networks would bring to a run without networks; empty if they are there, or not needed."""
-    from tracking3d.features.networks.catalogue import recommended_networks
-    from tracking3d.features.networks.store import State, state_of
-
-    networks = recommended_networks()
-    if tracker not in _WITHOUT_NETWORKS or all(
-        state_of(network, check=False) is not State.ABSENT for network in networks
-    ):
-        return ""
-    size = sum(network.size or 0 for network in networks) / 1e6
-    return (
-        f"`tracking3d models get recommended` ({size:.0f} MB), which the default, --tracker auto, then takes; mean IoU "
-        "of the initial masks with the true ones on four real clips: .93; with segment, which needs none, .90, with "
-        "csrt .86"
-    )
-
-
-_WITHOUT_NETWORKS = {"csrt", "flow", "segment"}

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, Video
-from tracking3d.cli.options.general import OUTPUT
-from tracking3d.cli.options.output import Browser, Host
+from tracking3d.cli.options.output import Browser, Host, Port
 from tracking3d.runtime.progress import report_progress
 
 if TYPE_CHECKING:
@@ -32,15 +31,7 @@ def view(
     ],
     source: Video = None,
     host: Host = None,
-    port: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=65535,
-            help="Port, or the next free one above it; 0 for any free port.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = 8080,
+    port: Port = 8080,
     browser: Browser = True,
     quiet: Quiet = False,
     debug: Debug = False,

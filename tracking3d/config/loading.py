@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import yaml
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import ValidationError
 
 from tracking3d.config.explain import describe_validation_error, format_value, hint
-from tracking3d.config.models import AUTO, ObjectConfig, PipelineConfig, PluginChoice, Section
+from tracking3d.config.models import AUTO, ObjectConfig, PipelineConfig, PluginChoice, PromptSection
 from tracking3d.errors import InputError, argument
 
 _MOST_LEAVES = 12  # settings of a layer that are listed one by one
@@ -272,41 +272,6 @@ def _validate(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
     except ValidationError as error:
         prefix = f"{origin}: " if origin else ""
         raise InputError(prefix + describe_validation_error(error, PipelineConfig)) from error
-
-
-# The section ``prompt`` of a configuration file: the prompt, written as for ``tracking3d run``.
-#
-# It belongs to one video, not to the pipeline, so only ``run`` reads it.
-
-
-def _one_or_several(value: Any) -> Any:
-    return (value,) if isinstance(value, str) else value
-
-
-Texts = Annotated[tuple[str, ...], BeforeValidator(_one_or_several)]
-"""One text or a list of them."""
-
-
-class PromptSection(Section):
-    """The objects to track; every value is written as on the command line."""
-
-    box: Texts = Field(
-        (), description="Box X,Y,W,H of the object in the first frame, or a list for several objects."
-    )
-    box_format: Literal["xywh", "xyxy"] | None = Field(
-        None,
-        description="How boxes are written here: xywh (X,Y,WIDTH,HEIGHT, the default) or xyxy (X1,Y1,X2,Y2).",
-    )
-    mask: Texts = Field(
-        (), description="Mask file of the object in the first frame, or a list for several objects."
-    )
-    points: Texts = Field(
-        (), description="Points 'X,Y+ X,Y-' in the first frame, or a list for several objects."
-    )
-    start_frame: int | None = Field(None, ge=0, description="Frame of the prompt, if not the first.")
-    correct: Texts = Field(
-        (), description="Correction FRAME:BOX, FRAME:MASK or FRAME:POINTS, or a list of several."
-    )
 
 
 Quality = Literal["draft", "good", "best"]

@@ -132,10 +132,8 @@ class PaperConfig(Section):
     knum: int = Field(30, ge=1, description="Maximum number of faces per pixel of the soft silhouette.")
     silhouette_bias: Literal["erode", "soften", "none"] = Field(
         "erode",
-        description=(
-            "How the bias of the soft silhouette is removed: erode the silhouette by 3x3, soften the target with the "
-            "same kernel, or not at all."
-        ),
+        description="How the bias of the soft silhouette is removed: erode the silhouette by 3x3, soften the target "
+        "with the same kernel, or not at all.",
     )
     motion_translation: float = Field(
         0.1, ge=0, description="Translation per frame since the last keyframe that is not penalized, eq. 3."
@@ -153,27 +151,21 @@ class PaperConfig(Section):
         0.0,
         ge=0,
         le=1,
-        description=(
-            "Return the initial mask if its IoU with the rendered mask is below this; 0 always returns the rendered "
-            "mask (paper)."
-        ),
+        description="Return the initial mask if its IoU with the rendered mask is below this; 0 always returns the "
+        "rendered mask (paper).",
     )
     stop: Literal["threshold", "plateau"] = Field(
         "threshold",
-        description=(
-            "Stop a frame as soon as the appearance loss is below tau (paper), or as soon as the total loss is below "
-            "its initial value and no longer falls. The best state is kept."
-        ),
+        description="Stop a frame as soon as the appearance loss is below tau (paper), or as soon as the total loss is "
+        "below its initial value and no longer falls. The best state is kept.",
     )
     patience: int = Field(
         10, ge=1, description="With plateau: iterations without progress before a frame stops."
     )
     prediction: Literal["last", "velocity"] = Field(
         "last",
-        description=(
-            "Motion model: a frame starts from the last pose (paper), or from the best of last pose, constant velocity "
-            "and the shift of the mask."
-        ),
+        description="Motion model: a frame starts from the last pose (paper), or from the best of last pose, constant "
+        "velocity and the shift of the mask.",
     )
     pose_iterations: int = Field(
         0,
@@ -182,10 +174,8 @@ class PaperConfig(Section):
     )
     joint_when: Literal["always", "new_view"] = Field(
         "always",
-        description=(
-            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new view or "
-            "that their pose alone does not explain; needs pose_iterations."
-        ),
+        description="Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new "
+        "view or that their pose alone does not explain; needs pose_iterations.",
     )
     texture_init: Literal["zero", "backprojected"] = Field(
         "zero",
@@ -194,19 +184,15 @@ class PaperConfig(Section):
     unseen_penalty: float | None = Field(
         None,
         ge=0,
-        description=(
-            "Loss of a pixel whose texture has never been seen, in place of its appearance loss; null treats it like "
-            "any other pixel (paper)."
-        ),
+        description="Loss of a pixel whose texture has never been seen, in place of its appearance loss; null treats "
+        "it like any other pixel (paper).",
     )
     init_frames: int = Field(
         1,
         ge=1,
         le=32,
-        description=(
-            "Number of first frames that are solved together from several rotation hypotheses; 1 switches this off "
-            "(paper)."
-        ),
+        description="Number of first frames that are solved together from several rotation hypotheses; 1 switches this "
+        "off (paper).",
     )
     init_iterations: int = Field(
         60, ge=1, description="Iterations of each hypothesis in that initialization."
@@ -267,20 +253,18 @@ class CameraConfig(Section):
     """The camera of the full frame."""
 
     fov: float | None = Field(
-        None, gt=1, lt=170, description="Vertical field of view in degrees; 45 if nothing better is known."
+        None, gt=1, lt=170, description="Vertical field of view in degrees. 45 if nothing better is known."
     )
     intrinsics: tuple[float, float, float, float] | None = Field(
         None,
-        description="Focal lengths and principal point fx, fy, cx, cy in pixels of the full frame; overrides fov.",
+        description="Focal lengths and principal point, in pixels of the full frame. As fx, fy, cx, cy; overrides fov.",
     )
 
     distortion: tuple[float, ...] | None = Field(
         None,
         max_length=14,
-        description=(
-            "Lens distortion coefficients k1, k2, p1, p2, k3 and so on in OpenCV's order. Images are undistorted when "
-            "they are read, and masks distorted when they are written."
-        ),
+        description="Lens distortion coefficients in OpenCV's order. They are k1, k2, p1, p2, k3 and so on; images are "
+        "undistorted when they are read, and masks distorted when they are written.",
     )
     distortion_model: Literal["radtan", "fisheye"] = Field(
         "radtan",
@@ -288,10 +272,8 @@ class CameraConfig(Section):
     )
     file: str | None = Field(
         None,
-        description=(
-            "Camera file, instead of intrinsics and distortion: YAML of OpenCV or ROS, Kalibr's camchain, or COLMAP's "
-            "cameras.txt."
-        ),
+        description="Camera file with intrinsics and distortion: YAML of OpenCV, ROS or Kalibr, or COLMAP's "
+        "cameras.txt.",
     )
 
     @model_validator(mode="after")
@@ -326,21 +308,18 @@ class ObjectConfig(Section):
 
     model: str | None = Field(
         None,
-        description=(
-            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without an "
-            "initialization by motion. Shape and colours are kept: adjustment_views and texture_views are 0, shape is "
-            "fast, and prototype is ignored."
-        ),
+        description="The folder of an earlier run or a mesh file: the object is that one, and is found in the video "
+        "without an initialization by motion. Shape and colours are kept: adjustment_views and texture_views are 0, "
+        "shape is fast, and prototype is ignored.",
     )
     extends: str | None = Field(
         None,
-        description=(
-            "The folder of an earlier run of the same object: at the end of this run the frames of both videos make "
-            "its mesh, with the sides that each of them shows."
-        ),
+        description="The folder of an earlier run of the same object: at the end of this run the frames of both videos "
+        "make its mesh, with the sides that each of them shows.",
     )
     prototype: str = Field(
-        "ellipsoid", description="Initial shape: sphere, ellipsoid (fitted to the first mask) or a mesh file."
+        "ellipsoid",
+        description="Initial shape: sphere, ellipsoid or a mesh file. The ellipsoid is fitted to the first mask.",
     )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
     texture_size: int = Field(150, ge=16, le=2048, description="Side of the feature texture in texels.")
@@ -348,94 +327,77 @@ class ObjectConfig(Section):
         16,
         ge=1,
         le=512,
-        description=(
-            "Features with more channels are reduced to this number by a principal component analysis inside the first "
-            "mask, and scaled to a common spread; null keeps them unchanged (paper)."
-        ),
+        description="Features with more channels are reduced to this number by a principal component analysis inside "
+        "the first mask, and scaled to a common spread; null keeps them unchanged (paper).",
     )
     adjustment_views: int = Field(
         120,
         ge=0,
         le=2000,
-        description=(
-            "Most keyframes in the final bundle adjustment of poses, surface and, if not given, focal length. 48 or a "
-            "fifth of the frames are taken unless they share too few landmarks. The other frames follow them. 0 "
-            "switches the adjustment off."
-        ),
+        description="Most keyframes in the final bundle adjustment of poses, surface and, if not given, focal length. "
+        "48 or a fifth of the frames are taken unless they share too few landmarks. The other frames follow them. 0 "
+        "switches the adjustment off.",
     )
     retrack_angle: float = Field(
         RETRACK_ANGLE,
         ge=0,
-        description=(
-            "With solver.final_refine: a tracked frame keeps its causal estimate if the final bundle adjustment moves "
-            "its pose by at most so many degrees against the other frames. 0 estimates every frame again."
-        ),
+        description="With solver.final_refine: a tracked frame keeps its causal estimate if the final bundle "
+        "adjustment moves its pose by at most so many degrees against the other frames. 0 estimates every frame "
+        "again.",
     )
     trust_masks: bool = Field(
         False,
-        description=(
-            "The initial masks are right: every frame that has one keeps it, and poses and surface are fitted to "
-            "it throughout."
-        ),
+        description="The masks of all frames (--masks) are right, for example drawn by hand: keep them. Poses and "
+        "surface are fitted to them throughout.",
     )
     refine_masks: bool = Field(
         True,
-        description=(
-            "Segment every frame again at the end of the final refinement, from shape, colour and motion in all frames "
-            "together. With trust_masks nothing is segmented again."
-        ),
+        description="Segment every frame again at the end of the final refinement, from shape, colour and motion in "
+        "all frames together. With trust_masks nothing is segmented again.",
     )
     mask_agreement: float = Field(
         MASK_AGREEMENT,
         gt=0,
         le=1,
-        description=(
-            "In the final refinement a mask that agrees by more than this IoU with the silhouette and the initial mask "
-            "is right: it need not be segmented again, nor its frame be estimated again. 1 does both in all frames."
-        ),
+        description="In the final refinement a mask that agrees by more than this IoU with the silhouette and the "
+        "initial mask is right: it need not be segmented again, nor its frame be estimated again. 1 does both in all "
+        "frames.",
     )
     mask_interval: int = Field(
         MASK_INTERVAL,
         ge=1,
         le=8,
-        description=(
-            "Frames from one that a mask tracker is asked about to the next, if it can leave frames out, while solver "
-            "online is sure of the object and tracks points on it; in between its mask is moved as these points are. "
-            "1 asks it about every frame."
-        ),
+        description="Frames from one that a mask tracker is asked about to the next, if it can leave frames out, while "
+        "solver online is sure of the object and tracks points on it; in between its mask is moved as these points "
+        "are. 1 asks it about every frame.",
     )
     texture_views: int = Field(
         24,
         ge=0,
         le=500,
-        description=(
-            "Frames that the texture of the mesh is taken from at the resolution of the video, after the final "
-            "refinement; 0 keeps the solver's texture, of size texture_size."
-        ),
+        description="Frames that the texture of the mesh is taken from at the resolution of the video, after the final "
+        "refinement; 0 keeps the solver's texture, of size texture_size.",
     )
     max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Maximum side of the texture image of the mesh, in texels."
     )
     shape: Literal["auto", "fast", "fine"] = Field(
         "auto",
-        description=(
-            "Shape of the final mesh: fast takes that of the online map; fine reconstructs it from all frames after "
-            "the final refinement, and keeps the result if it explains held-out frames better; auto does "
-            "so where that is possible."
-        ),
+        description="Shape of the final mesh: fast takes that of the online map; fine reconstructs it from all frames "
+        "after the final refinement, and keeps the result if it explains held-out frames better; auto does so where "
+        "that is possible.",
     )
     size: float | None = Field(
         None,
         gt=0,
         le=LARGEST_OBJECT,
-        description=(
-            "Metres of the object's longest side: of the longest side of the smallest box around what the video has "
-            "shown. All lengths of the finished run are then in metres; null leaves the run's arbitrary unit. A known "
-            "object has its own unit."
-        ),
+        description="Metres of the object's longest side; all lengths of the run are then in metres. It is that of the "
+        "smallest box around what the video has shown; null leaves the run's arbitrary unit. A known object has its "
+        "own unit.",
     )
     flat: bool = Field(
-        False, description="Planar object: project all vertices onto one plane after each iteration."
+        False,
+        description="The object is planar, like a card. All vertices are projected onto one plane at each iteration.",
     )
 
     @property
@@ -465,7 +427,10 @@ class CropConfig(Section):
     """The crop of the frame that is rendered and compared."""
 
     size: int = Field(
-        128, ge=32, le=1024, description="Working resolution: side of the square crop in pixels."
+        128,
+        ge=32,
+        le=1024,
+        description="Working resolution: side of the square crop around the object, in pixels.",
     )
     margin: float = Field(
         0.3,
@@ -478,15 +443,13 @@ class CropConfig(Section):
 class RuntimeConfig(Section):
     """Device, threads, and what a run keeps and tolerates."""
 
-    device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
-    seed: int = Field(0, ge=0, lt=2**64, description="Random seed.")
+    device: str = Field("cpu", description="Device: cpu, cuda or cuda:N.")
+    seed: int = Field(0, ge=0, lt=2**64, description="Random seed of the run.")
     threads: int = Field(
         1,
         ge=1,
-        description=(
-            "CPU threads of torch and of the renderer. One is hardly slower than several, and far faster on a busy "
-            "machine or if several runs share it. The final bundle adjustment uses as many threads as OpenCV does."
-        ),
+        description="CPU threads of torch and of the renderer. One is hardly slower than several, and far faster on a "
+        "busy machine or if several runs share it. The final bundle adjustment uses as many threads as OpenCV does.",
     )
     renderer: Literal["auto", "torch", "numba"] = Field(
         "auto",
@@ -496,29 +459,66 @@ class RuntimeConfig(Section):
         8,
         ge=0,
         le=64,
-        description=(
-            "Saved states of earlier frames that a correction can restart from, also after the run has finished; 0 for "
-            "none."
-        ),
+        description="Saved states of earlier frames that a correction can restart from, also after the run has "
+        "finished; 0 for none.",
     )
     probabilities: bool = Field(
         False, description="Write the object probability of every pixel too, as 8-bit PNG."
     )
     on_plugin_failure: Literal["continue", "stop"] = Field(
         "continue",
-        description=(
-            "If a plug-in fails after the first frame: record the reason and continue with the last mask, or stop and "
-            "keep the finished frames."
-        ),
+        description="If a plug-in fails after the first frame: continue with the last mask, or stop. The reason is "
+        "recorded, and finished frames are kept.",
+    )
+
+
+def _one_or_several(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Texts = Annotated[tuple[str, ...], BeforeValidator(_one_or_several)]
+"""One text or a list of them."""
+
+
+class PromptSection(Section):
+    """The objects to track; every value is written as on the command line. Only ``run`` reads it, for one video."""
+
+    box: Texts = Field(
+        (),
+        description="Box around the object in the first frame, in pixels, or a file in VOT's region format; several "
+        "boxes are several objects.",
+    )
+    box_format: Literal["xywh", "xyxy"] | None = Field(
+        None, description="How boxes are written: X,Y,WIDTH,HEIGHT, the default, or X1,Y1,X2,Y2."
+    )
+    mask: Texts = Field(
+        (),
+        description="Mask image of the object in the first frame; @N picks object N of an indexed image, and several "
+        "masks are several objects.",
+    )
+    points: Texts = Field(
+        (),
+        description="Points in the first frame, + on the object and - on the background; several are several objects.",
+    )
+    start_frame: int | None = Field(
+        None,
+        ge=0,
+        description="Frame of the prompt, if not the first; tracking runs forwards and backwards from it.",
+    )
+    correct: Texts = Field(
+        (), description="Prompt in a later frame, or several; the mask tracker restarts from it."
     )
 
 
 class PipelineConfig(Section):
     """The whole pipeline."""
 
-    tracker: PluginChoice = PluginChoice(name=AUTO)
-    features: PluginChoice = PluginChoice(name="rgb")
-    keypoints: PluginChoice = PluginChoice(name="sift")
+    tracker: PluginChoice = Field(
+        PluginChoice(name=AUTO),
+        description="Mask tracker; `tracking3d plugins` lists them, and auto takes the best one at hand.",
+    )
+    features: PluginChoice = Field(PluginChoice(name="rgb"), description="Feature encoder.")
+    keypoints: PluginChoice = Field(PluginChoice(name="sift"), description="Keypoint detector.")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
     crop: CropConfig = CropConfig()

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tracking3d.engines.processes import ProcessEngine
-from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Engine, Event, Needs, Task, Told
+from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Engine, Event, Needs, ProgressReport, Task
 from tracking3d.engines.worker import call
 
 
@@ -58,7 +58,7 @@ class InThisProcess:
         if task is None:
             return []
         reports: list[Event] = []
-        value, fault = call(task, lambda content: reports.append(Told(task.number, content)))
+        value, fault = call(task, lambda content: reports.append(ProgressReport(task.number, content)))
         return [Began(task.number, "this process"), *reports, Ended(task.number, value, fault)]
 
     def share(self, file: Path) -> None:

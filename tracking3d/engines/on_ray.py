@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.engines.processes import default_workers
-from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
+from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, ProgressReport, Task
 from tracking3d.engines.worker import call, last_words, threads_in_words
 from tracking3d.errors import InputError
 
@@ -182,7 +182,7 @@ class RayEngine:
                 self._begun.add(number)
                 events.append(Began(number, f"worker {self._slots[number]} ({machine})"))
             else:
-                events.append(Told(number, content))
+                events.append(ProgressReport(number, content))
         return events
 
     def _answer(self, one: Any, task: Task) -> tuple[Any, Fault | None]:

@@ -21,7 +21,7 @@ from typing import Any
 
 import psutil
 
-from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
+from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, ProgressReport, Task
 from tracking3d.engines.worker import call, interruptible, last_words, threads_in_words
 
 GRACE = 20.0
@@ -134,7 +134,7 @@ class ProcessEngine:
             except (EOFError, OSError):
                 return
             if kind == "report":
-                self._events.append(Told(running.task.number, content))
+                self._events.append(ProgressReport(running.task.number, content))
             else:
                 running.value, running.fault = content
                 running.has_ended = True

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-Tell = Callable[[Any], None]
+Reporter = Callable[[Any], None]
 """Called by a function in a worker to report its progress; the report is pickled."""
 
 
@@ -55,7 +55,7 @@ class Began:
 
 
 @dataclass(frozen=True)
-class Told:
+class ProgressReport:
     """A report of a running task."""
 
     number: int
@@ -73,7 +73,7 @@ class Ended:
     again: bool = False  # whether it will be tried once more
 
 
-Event = Began | Told | Ended
+Event = Began | ProgressReport | Ended
 
 
 class Shared(Protocol):

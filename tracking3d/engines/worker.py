@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from tracking3d.engines.protocol import Fault, Task, Tell
+from tracking3d.engines.protocol import Fault, Reporter, Task
 from tracking3d.errors import Tracking3dError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -26,7 +26,7 @@ def threads_in_words(threads: int) -> dict[str, str]:
     return dict.fromkeys(THREAD_VARIABLES, str(threads))
 
 
-def call(task: Task, tell: Tell, threads: int = 1) -> tuple[Any, Fault | None]:
+def call(task: Task, tell: Reporter, threads: int = 1) -> tuple[Any, Fault | None]:
     """Do a task in this process: what it returned, or why it failed.
 
     Raises:

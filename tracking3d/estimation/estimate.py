@@ -81,7 +81,8 @@ class FrameEstimate:
         stages: The same stage by stage, as far as they are over; None if nobody timed them.
         mask_source: Where the mask comes from; None if it is not known.
         probability: ``(H, W)`` float32 of the object, pixel by pixel, where the mask was weighed against the image: the
-            mask is where it is above a half. It orders pixels and is not calibrated. None otherwise.
+            mask is where it is above a half. It orders pixels and is not calibrated. None otherwise, and in ``revised``
+            estimates without ``runtime.probabilities``.
         failure: Which plug-in failed at this frame, and why, in words; empty if none did.
         hypothesis: The winning hypothesis of the pose, in a word or two; empty if there was no choice.
         refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
@@ -166,6 +167,12 @@ def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float6
         confidence=0.0,
         mask_source=MaskSource.as_initial(initial),
     )
+
+
+def without_masks(estimate: FrameEstimate) -> FrameEstimate:
+    """An estimate without what takes much memory."""
+    nothing = np.zeros((0, 0), bool)
+    return replace(estimate, mask=nothing, initial_mask=None, probability=None, revised=())
 
 
 def mark_failed(estimate: FrameEstimate, failure: str) -> FrameEstimate:

@@ -132,7 +132,7 @@ class RefiningSolver(Protocol, Generic[State]):
         return None
 
     def extend(self, state: State, gap: Gap) -> tuple[State, list[FrameEstimate]]:
-        """Track the object through a gap, and learn from it; the gap's anchor is one of ``ModelCoverage.anchors``."""
+        """Track through a gap, whose anchor is one of ``ModelCoverage.anchors``, and learn; estimates without masks."""
         return state, []
 
     def end_extension(self, state: State, found: Collection[int], last: int) -> State:

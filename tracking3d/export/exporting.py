@@ -6,15 +6,14 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tracking3d.config.camera import check_object_size
 from tracking3d.config.explain import nearest
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exporter import Exporter
-from tracking3d.export.formats import FORMATS
+from tracking3d.export.formats import FORMATS, Exporter
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.layout import ARBITRARY, EXPORT, OVERWRITE, check_run_folder, partial_path, run_files
 from tracking3d.runtime.progress import report_progress
@@ -33,19 +32,8 @@ _END_OF_TIME = 2.0**31
 _OUT = argument("out=", "--out")
 _TO = argument("to=", "--to")
 _NAMED = {
-    "object_size": argument("object_size=", "--object-size"),
-    "fps": argument("fps=", "--fps"),
-    "source": argument("source=", "--source"),
-    "of": argument("of=", "--of"),
-    "cut_out": argument("cut_out=", "--cut-out"),
-    "unseen": argument("unseen=", "--unseen"),
-    "undistorted": argument("undistorted=", "--undistorted"),
-    "images": argument("images=", "--no-images"),
-    "start_time": argument("start_time=", "--start-time"),
-    "compressed_images": argument("compressed_images=", "--compressed-images"),
-    "frame": argument("frame=", "--frame"),
-    "xy": argument("xy=", "--xy"),
-}
+    one.name: argument(f"{one.name}=", f"--{one.name.replace('_', '-')}") for one in fields(ExportOptions)
+} | {"images": argument("images=", "--no-images")}
 
 
 @dataclass(frozen=True)
@@ -250,37 +238,22 @@ def _remove(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
+# fmt: off
 OTHER_NAMES = {
-    "gltf": ("glb", "animated-glb"),
     **dict.fromkeys(("usd", "usda", "usdc"), ("usdz",)),
     **dict.fromkeys(("ros", "ros2", "rosbag", "bag", "db3"), ("ros-bag",)),
-    "obj": ("glb", "nuke"),
-    "fbx": ("animated-glb", "usdz"),
-    "abc": ("animated-glb", "usdz"),
-    "alembic": ("animated-glb", "usdz"),
-    "ae": ("after-effects",),
-    "jsx": ("after-effects",),
-    "chan": ("nuke",),
-    "blend": ("blender",),
-    "rrd": ("rerun",),
-    "mov": ("prores",),
-    "webm": ("vp9",),
-    "mp4": ("vp9", "prores"),
-    "video": ("vp9", "prores"),
-    "png": ("davis", "cut-outs"),
-    "masks": ("davis", "coco", "vot"),
-    "json": ("coco", "nerfstudio"),
-    "nerf": ("nerfstudio",),
-    "instant-ngp": ("nerfstudio",),
-    "gaussian-splatting": ("colmap",),
-    "3dgs": ("colmap",),
-    "trajectory": ("tum", "kitti"),
-    "txt": ("tum",),
-    "poses": ("csv", "tum", "bop"),
-    "points": ("points-csv", "tapvid"),
-    "npz": ("tapvid",),
-    "mesh": ("glb", "ply", "stl"),
+    **dict.fromkeys(("fbx", "abc", "alembic"), ("animated-glb", "usdz")),
+    **dict.fromkeys(("ae", "jsx"), ("after-effects",)),
+    **dict.fromkeys(("mp4", "video"), ("vp9", "prores")),
+    **dict.fromkeys(("nerf", "instant-ngp"), ("nerfstudio",)),
+    **dict.fromkeys(("gaussian-splatting", "3dgs"), ("colmap",)),
+    "gltf": ("glb", "animated-glb"), "obj": ("glb", "nuke"), "mesh": ("glb", "ply", "stl"),
+    "chan": ("nuke",), "blend": ("blender",), "rrd": ("rerun",), "mov": ("prores",), "webm": ("vp9",),
+    "png": ("davis", "cut-outs"), "masks": ("davis", "coco", "vot"), "json": ("coco", "nerfstudio"),
+    "trajectory": ("tum", "kitti"), "txt": ("tum",), "poses": ("csv", "tum", "bop"),
+    "points": ("points-csv", "tapvid"), "npz": ("tapvid",),
 }
+# fmt: on
 """By name in small letters, without a dot before it."""
 
 

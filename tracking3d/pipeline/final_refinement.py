@@ -167,10 +167,9 @@ class FinalRefinement:
     @property
     def passed_over(self) -> dict[str, int]:
         """How many frames each pass has left as they were, by its name."""
-        again = self._last.retracked if self._precomputed is None else self._precomputed.retracked
-        masks = self._last.masks
-        kept = 0 if masks is None else len(masks.kept)
-        kept = kept if self._precomputed is None else self._precomputed.kept_masks
+        done, masks = self._precomputed, self._last.masks
+        again = self._last.retracked if done is None else done.retracked
+        kept = done.kept_masks if done else len(masks.kept) if masks else 0
         return {"retracking": len(self._retracking.kept) - len(again), "masks": kept}
 
     @property

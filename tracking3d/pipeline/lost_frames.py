@@ -197,7 +197,7 @@ def try_second_start(
         inliers = [one.diagnostics["inliers"] for one in found.values() if one.diagnostics]
         return may_win(now, gaps.confidence, frames, tried.left, plain and bool(inliers) and not any(inliers))
 
-    if not session.order_of_time or len(gaps.unexplained) <= _MAX_UNEXPLAINED * frames:
+    if tried.left <= 0 or not session.order_of_time or len(gaps.unexplained) <= _MAX_UNEXPLAINED * frames:
         return None
     start = find_start(source, masks)
     if start is None:

@@ -292,7 +292,7 @@ def begin_recording(
     )
     keep_given_masks(folder, opened.first.index, one.prompt, one.corrections.values())
     if checkpoint is not None and kept is not None:
-        checkpoint.clear_strangers()
+        checkpoint.remove_orphans()
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
         session.load_state_dict(opened.first, kept.session, failures)
         writer.use_camera(session.camera)
@@ -331,7 +331,7 @@ def _header(
         source_notes=source_notes(source),
         selection=options.selection,
         renderer=session.renderer,
-        given=given,
+        prompt=given,
         tracker_choice=opened.tracker_choice,
     )
 

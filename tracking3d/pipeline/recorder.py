@@ -25,6 +25,7 @@ from tracking3d.pipeline.session import Session
 from tracking3d.reconstruction import bake_texture, close_unseen
 from tracking3d.reconstruction.final_shape import is_reconstructed
 from tracking3d.results import layout
+from tracking3d.results.checkpoint.folder import finish_state
 from tracking3d.results.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
 from tracking3d.results.checkpoint.run_state import RunState
 from tracking3d.results.files import read_mask
@@ -315,7 +316,7 @@ class ObjectRecorder:
         report_progress("writing the model")
         self._writer.finish(model, "finished")
         if self._state.checkpoint:
-            self._state.checkpoint.finish()
+            finish_state(self._writer.folder)
 
     def pause(self) -> None:
         """Stop here; the folder is that of a stopped run, which can be resumed."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
-from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask
+from tracking3d.estimation.estimate import FrameEstimate, mark_failed, with_initial_mask, without_masks
 from tracking3d.estimation.solver import Gap, ModelCoverage, PhotoSet, RefinedStart, RefiningSolver, Solver
 from tracking3d.estimation.undistortion import Undistortion
 from tracking3d.frames import Frame, MaskEstimate
@@ -147,7 +147,7 @@ class SessionRefinement:
                         state, estimate = solver.step(state, order.number(frame), mask)
                         estimate = order.index(estimate)
                     latest = max(latest, frame.index)
-                    found |= {one.index: _without_masks(one) for one in (*estimate.revised, estimate)}
+                    found |= {one.index: without_masks(one) for one in (*estimate.revised, estimate)}
                     if not goes_on(found):
                         return None
         except PluginFailure:
@@ -266,9 +266,3 @@ class SessionRefinement:
         if not isinstance(self._solver, RefiningSolver):
             raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")
         return self._solver
-
-
-def _without_masks(estimate: FrameEstimate) -> FrameEstimate:
-    """An estimate without what takes much memory."""
-    nothing = np.zeros((0, 0), bool)
-    return replace(estimate, mask=nothing, initial_mask=None, probability=None, revised=())

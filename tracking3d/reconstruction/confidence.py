@@ -13,18 +13,14 @@ from tracking3d.estimation.estimate import Assessment, Status
 from tracking3d.frames import TRACKED_CONFIDENCE
 from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.results.records import FrameRecord
+from tracking3d.runtime.logistic_model import LogisticModel
 
 _EVEN, _NEARLY_ALL = 0.5, 0.95
 """Shares of the followed landmarks that agree, between which belief grows: if poses are wrong, what is followed is
 often something else, such as the background, and much of it fits no pose."""
 _ENOUGH = 30
 """Landmark inliers from which on more of them add nothing."""
-_INTERCEPT = -1.48
-_TERMS = {  # weight, and the range that was seen
-    "rendering": (1.01, -1.62, 4.11),
-    "share": (0.366, 0.0, math.log(_NEARLY_ALL / (1 - _NEARLY_ALL))),
-    "landmarks": (0.191, 0.0, math.log1p(_ENOUGH)),
-}
+_MODEL = LogisticModel.load("refined_confidence")
 
 
 def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[Assessment, dict[str, float]]:
@@ -42,10 +38,8 @@ def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[As
 def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
-    The confidence is that of the rendering, or a lower one that the landmarks give. The latter is a logistic regression
-    of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. It was fitted to synthetic suites
-    and one real clip; history/pages/method/confidence.md says which, and what it is worth on others. A plain object
-    has no landmarks, and keeps the confidence of its rendering.
+    The confidence is that of the rendering, or a lower one that the landmarks give, see
+    history/pages/method/confidence.md. A plain object has no landmarks, and keeps the confidence of its rendering.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -54,8 +48,7 @@ def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Ass
     if rendering.status is Status.LOST:
         return rendering
     evidence = refined_confidence_features(rendering.confidence, support)
-    odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
-    confidence = min(rendering.confidence, 1 / (1 + math.exp(-_INTERCEPT - odds)))
+    confidence = min(rendering.confidence, _MODEL.probability(evidence))
     if confidence >= TRACKED_CONFIDENCE:
         return Assessment(Status.TRACKED, "", confidence)
     reason = rendering.reason

@@ -7,7 +7,7 @@ within the mask and on the outline.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from tracking3d.geometry.levenberg_marquardt import Damping, minimizer
 from tracking3d.reconstruction.meshing import cell_atlas
 from tracking3d.rendering import (
     BackProjection,
+    NormalEquations,
     PoseTarget,
     Scales,
     Surface,
@@ -33,7 +35,6 @@ COLOUR, OUTLINE = 0.1, 2.0
 """Difference of colours in [0, 1], and pixels, from which on a disagreement counts less."""
 OUTLINE_WEIGHT = 0.3
 _STEPS = 6
-_ENOUGH = 1e-4
 _FARTHEST = 5.0  # degrees a pose may turn; a view that turns farther is rejected
 
 
@@ -78,6 +79,13 @@ def refine_views(surface: Surface, views: Sequence[ObjectView]) -> list[ObjectVi
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    pose: NDArray[np.float64]  # (4, 4)
+    model: NormalEquations  # of colours and outline there
+    cost: float
+
+
 def _fit_pose(surface: Surface, view: ObjectView) -> NDArray[np.float64]:
     """``(4, 4)`` the pose that fits best, the present one if none fits better or it runs away."""
     mask = torch.from_numpy(view.mask)
@@ -90,32 +98,21 @@ def _fit_pose(surface: Surface, view: ObjectView) -> NDArray[np.float64]:
         torch.from_numpy(-view.signed_distance),
     )
     first = view.T_cam_obj
-    pose, (cost, matrix, gradient) = first, _cost(surface, target, first)
-    damping = 1e-3
-    for _ in range(_STEPS):
-        diagonal = np.diag(matrix)
-        step = np.linalg.solve(
-            matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-300), -gradient
-        )
-        trial = pose.copy()
-        trial[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
+
+    def evaluated(pose: NDArray[np.float64]) -> _Pose:
+        R, t = torch.from_numpy(pose[None, :3, :3]).float(), torch.from_numpy(pose[None, :3, 3]).float()
+        terms = pose_terms(surface, target, R, t, None, Scales(COLOUR, OUTLINE, 1.0))
+        model = terms.appearance + terms.outline * OUTLINE_WEIGHT
+        return _Pose(pose, model, float(model.cost[0]))
+
+    def stepped(_: None, at: _Pose, model: NormalEquations, damping: float) -> _Pose:
+        step = model.step(damping)[0].numpy()
+        trial = at.pose.copy()
+        trial[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ at.pose[:3, :3]
         trial[:3, 3] += step[:3]
-        result = _cost(surface, target, trial)
-        if result[0] < cost:
-            gain, damping = cost - result[0], max(damping / 4, 1e-6)
-            pose, (cost, matrix, gradient) = trial, result
-            if gain < _ENOUGH * cost:
-                break
-        else:
-            damping *= 8
+        return evaluated(trial)
+
+    best, _ = minimizer(lambda _, at: at.model, stepped)(None, evaluated(first), Damping(), _STEPS)
+    pose = best.pose
     turned = Rotation.from_matrix(pose[:3, :3] @ first[:3, :3].T).magnitude()
     return pose if np.degrees(turned) < _FARTHEST else first
-
-
-def _cost(
-    surface: Surface, target: PoseTarget, pose: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    R, t = torch.from_numpy(pose[None, :3, :3]).float(), torch.from_numpy(pose[None, :3, 3]).float()
-    terms = pose_terms(surface, target, R, t, None, Scales(COLOUR, OUTLINE, 1.0))
-    model = terms.appearance + terms.outline * OUTLINE_WEIGHT
-    return float(model.cost[0]), model.matrix[0].numpy(), model.gradient[0].numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from tracking3d.rendering.normal_equations import NormalEquations
@@ -23,6 +24,14 @@ class PoseTarget:
     inside: Tensor  # (S, S) bool, inside the frame
     mask: Tensor | None  # (S, S) bool; None if there is none
     distance: Tensor | None  # (S, S) signed distance in pixels to the mask's outline; None without a mask
+
+    def overlap(self, covered: Tensor) -> Tensor:
+        """IoU of covered pixels ``(..., S, S)`` with the mask, inside the frame; 1 without a mask."""
+        if self.mask is None:
+            return torch.ones(covered.shape[:-2], dtype=torch.float64)
+        covered, mask = covered & self.inside, self.mask & self.inside
+        either = (covered | mask).sum((-2, -1)).clamp_min(1)
+        return ((covered & mask).sum((-2, -1)).double() / either).cpu()
 
 
 @dataclass(frozen=True, eq=False)

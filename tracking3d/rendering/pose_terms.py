@@ -22,7 +22,7 @@ from tracking3d.rendering.pose_comparison import (
     Scales,
     check_comparison,
 )
-from tracking3d.rendering.renderer import Rendering, render
+from tracking3d.rendering.renderer import render
 from tracking3d.rendering.surface import Surface, check_shapes, sample_texture
 
 
@@ -80,21 +80,12 @@ def _compose(
         _on_host(points),
         zero.index_add(0, view, comparable).double().cpu(),
         zero.index_add(0, view, known).double().cpu(),
-        _overlap(drawn, target),
+        target.overlap(drawn.face_index >= 0),
     )
 
 
 def _on_host(model: NormalEquations) -> NormalEquations:
     return NormalEquations(*(part.double().cpu() for part in (model.matrix, model.gradient, model.cost)))
-
-
-def _overlap(drawn: Rendering, target: PoseTarget) -> Tensor:
-    """``(B,)`` see `PoseTerms`."""
-    if target.mask is None:
-        return torch.ones(len(drawn.face_index), dtype=torch.float64)
-    covered, mask = (drawn.face_index >= 0) & target.inside, target.mask & target.inside
-    either = (covered | mask).sum((1, 2)).clamp_min(1)
-    return ((covered & mask).sum((1, 2)).double() / either).cpu()
 
 
 def _points(matched: MatchedPoints, K: Tensor, R: Tensor, t: Tensor, scale: float) -> NormalEquations:

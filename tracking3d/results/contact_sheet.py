@@ -96,6 +96,7 @@ def draw_contact_sheet(
     model: ObjectModel | None,
     run: dict[str, Any],
     replaced: Set[int] = frozenset(),
+    earlier: Image | None = None,
 ) -> Image:
     """Draw the sheet.
 
@@ -104,11 +105,15 @@ def draw_contact_sheet(
         model: The object; None leaves texture and mesh out.
         run: ``run.json`` of the run, as it is at the end.
         replaced: Frames whose crop shows an estimate that is not the last one.
+        earlier: A sheet of the same crops, from which these are taken.
 
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
     """
     tiles = [_add_label(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
+    if earlier is not None:
+        grid = earlier[: len(earlier) // TILE * TILE].reshape(-1, TILE, COLUMNS, TILE, 3).swapaxes(1, 2)
+        tiles = [*grid.reshape(-1, TILE, TILE, 3)[: len(tiles)]]
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     if model is not None:
         texture = np.where((model.texture_weight > 0)[..., None], model.texture, model.texture // 3 + 40)

@@ -276,19 +276,8 @@ def points_to_json(tracks: PointTracks, there: PointTracks | None = None) -> str
 
 
 COLUMNS = [
-    "frame",
-    "point",
-    "x",
-    "y",
-    "visible",
-    "on_object",
-    "uncertainty",
-    "measured",
-    "X",
-    "Y",
-    "Z",
-    "kind",
-]
+    "frame", "point", "x", "y", "visible", "on_object", "uncertainty", "measured", "X", "Y", "Z", "kind",
+]  # fmt: skip
 
 
 def points_to_csv(tracks: PointTracks, there: PointTracks | None = None) -> str:

@@ -28,22 +28,22 @@ MOST_FAILURES = 20
 """Different reasons of plug-in failures that a summary lists; the commonest come first."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RunHeader:
-    """The facts of a run before its first frame."""
+    """The facts of a run before its first frame, as ``run.json`` names and orders them."""
 
-    config: dict[str, Any]  # the configuration as used
-    camera: Camera  # the camera of the full frame
     source: str  # the tracked video, in words
-    seed: int  # seed of everything random
+    selection: str | None = None  # the START:STOP:STEP that the source was opened with
+    # the identity of source and prompt, see `tracking3d.results.checkpoint.resuming.prompt_record`
+    prompt: Mapping[str, Any] | None = None
     fps: float | None  # frames per second of the source, if known
     command: str | None  # the command line, if there was one
     source_notes: Sequence[str] = ()  # how the source processed its images, in clauses
-    selection: str | None = None  # the START:STOP:STEP that the source was opened with
-    renderer: Mapping[str, str | int] | None = None  # what renders, and why
-    # the identity of source and prompt, see `tracking3d.results.checkpoint.resuming.prompt_record`
-    given: Mapping[str, Any] | None = None
+    seed: int  # seed of everything random
+    config: dict[str, Any]  # the configuration as used
     tracker_choice: str | None = None  # why auto chose the mask tracker of config; None if the user named it
+    camera: Camera  # the camera of the full frame
+    renderer: Mapping[str, str | int] | None = None  # what renders, and why
 
 
 def for_new_folder(command: str) -> str:
@@ -62,17 +62,9 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
         "finished": None,
         "process": this_process(),
         "resumed": [],
-        "source": header.source,
-        "selection": header.selection,
-        "prompt": header.given,
-        "fps": header.fps,
-        "command": header.command,
+        **vars(header),
         "source_notes": list(header.source_notes),
-        "seed": header.seed,
-        "config": header.config,
-        "tracker_choice": header.tracker_choice,
         "camera": asdict(header.camera),
-        "renderer": header.renderer,
         "versions": versions(),
         "conventions": CONVENTIONS,
         "unit": {"name": ARBITRARY},

@@ -126,8 +126,6 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
 
 def image_file(image: NDArray[np.uint8]) -> bytes:
     """``(H, W)`` grey or ``(H, W, 3)`` RGB uint8 as PNG."""
-    import cv2
-
     ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     return cv2.imencode(".png", ordered)[1].tobytes()
 
@@ -203,8 +201,6 @@ def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
     """``(H, W)`` from the bytes of an image file; None if they are no image, or too large a one."""
-    import cv2
-
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:  # more pixels than OpenCV decodes

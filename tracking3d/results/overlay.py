@@ -106,7 +106,7 @@ def draw_overlay(
     if estimate.initial_mask is not None:
         drawing.draw_outline(picture, _scale(estimate.initial_mask, shape), drawing.INITIAL, thin)
     if axes is not None and estimate.status is Status.TRACKED:
-        _draw_axes(picture, estimate, camera, axes, size.scale, thin + 1)
+        draw_axes(picture, estimate.T_cam_obj, camera, axes, size.scale, thin + 1, estimate.mask)
     _draw_bar(canvas[size.picture :], record, size.line)
     return canvas
 
@@ -117,23 +117,29 @@ def _scale(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]
     return cv2.resize(mask.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def _draw_axes(
+def draw_axes(
     picture: Image,
-    estimate: FrameEstimate,
+    T_cam_obj: NDArray[np.float64],
     camera: Camera,
     axes: ObjectAxes,
     scale: float,
     thickness: int,
+    mask: NDArray[np.bool_] | None = None,
 ) -> None:
+    """Draw x red, y green and z blue, the nearest on top.
+
+    Nothing is drawn if they reach behind the camera, or begin beside a mask ``(H, W)`` that is given; ``scale`` is the
+    picture's, of the frame.
+    """
     ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
-    points = ends @ estimate.T_cam_obj[:3, :3].T + estimate.T_cam_obj[:3, 3]
+    points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:
         return
     pixels = camera.to_picture((points @ camera.K.T)[:, :2] / points[:, 2:])
-    if not np.isfinite(pixels).all() or not _is_on(estimate.mask, pixels[0]):
+    if not np.isfinite(pixels).all() or not (mask is None or _is_on(mask, pixels[0])):
         return
     pixels = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
-    for axis in np.argsort(-points[1:, 2]):  # the nearest last, on top
+    for axis in np.argsort(-points[1:, 2]):
         cv2.line(picture, pixels[0], pixels[axis + 1], _AXIS_COLOURS[axis], thickness, cv2.LINE_AA)
 
 

@@ -47,6 +47,7 @@ from tracking3d.video import FrameSource
 _LONGEST_KEY = 1024  # bytes
 _DAMAGED = (OSError, ValueError)
 _VERSION = 1  # of the saved file; another one is computed again
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,36 +76,16 @@ class RunScene:
         """
         query = as_points(xy)
         asked = tracked_record(self.run, frame)
-        records = self.run.frames
-        start = next(row for row, one in enumerate(records) if one is asked)
+        start = next(row for row, one in enumerate(self.run.frames) if one is asked)
         inside = in_frame(self.run.camera, query)
         camera = self.run.camera_of(asked)
-        seen = camera.to_pinhole(query)
+        seen = np.where(inside[:, None], camera.to_pinhole(query), np.nan)
         report_progress("following points")
-        found = follow_points(self.scene, start, np.where(inside[:, None], seen, np.nan))
-        on_object = np.asarray(np.isfinite(found.points).all(1))
-        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
-        if (view := self.scene.views[start]) is not None and on_object.any():
-            face[on_object], barycentric[on_object] = surface_under(
-                *view.project(self.scene.vertices), self.scene.faces, view.to_window(seen[on_object])
-            )
-        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
-        tracks = PointTracks(
-            frame,
-            query,
-            np.array([one.index for one in records], dtype=np.int64),
-            camera.to_picture(found.positions.reshape(-1, 2)).reshape(found.positions.shape),
-            found.visible & ~lost[:, None],
-            on_object,
-            face,
-            barycentric,
-            found.points,
-            found.uncertainty,
-            found.measured,
-            kinds(on_object),
-        )
+        found = follow_points(self.scene, start, seen)
+        positions = camera.to_picture(found.positions.reshape(-1, 2)).reshape(found.positions.shape)
+        tracks = self._tracks(frame, query, found, self.scene.views[start], seen, slice(None), positions)
         on_it = on_mask(self.run, frame, query)
-        rest = np.flatnonzero(~on_object & inside & (on_it | beside_object))
+        rest = np.flatnonzero(~tracks.on_object & inside & (on_it | beside_object))
         if self.pictures is None or not len(rest):
             return tracks
         points = follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
@@ -144,33 +125,39 @@ class RunScene:
         seen = self.run.camera_of(asked).to_pinhole(query)
         seen[~in_frame(self.run.camera, query)] = np.nan
         found = follow_points(replace(other.scene, views=views, support={}), place, seen)
-        on_object = np.asarray(np.isfinite(found.points).all(1))
-        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
-        if on_object.any():
-            face[on_object], barycentric[on_object] = surface_under(
-                *view.project(other.scene.vertices), other.scene.faces, view.to_window(seen[on_object])
-            )
-        records = other.run.frames
-        rest = [row for row in range(len(views)) if row != place]
-        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
+        rows = [row for row in range(len(views)) if row != place]
         positions = [
             other.run.camera_of(one).to_picture(at)
-            for one, at in zip(records, found.positions[rest], strict=True)
+            for one, at in zip(other.run.frames, found.positions[rows], strict=True)
         ]
+        return other._tracks(frame, query, found, view, seen, rows, np.stack(positions))
+
+    def _tracks(
+        self,
+        frame: int,
+        query: Array,
+        found: Followed,
+        view: Drawn | None,
+        seen: Array,
+        rows: slice | list[int],
+        positions: Array,
+    ) -> PointTracks:
+        """What was ``found`` in ``rows``, the frames of this run, of pixels ``seen`` ``(N, 2)`` in a ``view`` of it."""
+        on_object = np.asarray(np.isfinite(found.points).all(1))
+        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
+        if view is not None and on_object.any():
+            face[on_object], barycentric[on_object] = surface_under(
+                *view.project(self.scene.vertices), self.scene.faces, view.to_window(seen[on_object])
+            )
+        records = self.run.frames
+        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
+        indices = np.array([one.index for one in records], dtype=np.int64)
+        visible = found.visible[rows] & ~lost[:, None]
+        unsure, measured = found.uncertainty[rows], found.measured[rows]
         return PointTracks(
-            frame,
-            query,
-            np.array([one.index for one in records], dtype=np.int64),
-            np.stack(positions),
-            found.visible[rest] & ~lost[:, None],
-            on_object,
-            face,
-            barycentric,
-            found.points,
-            found.uncertainty[rest],
-            found.measured[rest],
+            frame, query, indices, positions, visible, on_object, face, barycentric, found.points, unsure, measured,
             kinds(on_object),
-        )
+        )  # fmt: skip
 
 
 def open_scene(
@@ -314,9 +301,6 @@ def _write(file: Path, key: str, vertices: NDArray[np.float64], T_cam_obj: NDArr
         write_atomic(file, data.getvalue())
     except OutputError:
         return  # a folder that is only read
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

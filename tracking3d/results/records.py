@@ -7,10 +7,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainValidator, TypeAdapter, ValidationError
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
 from tracking3d.frames import SkippedFrame
@@ -18,62 +19,57 @@ from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.stage_times import StageTimes
 
-_KINDS: dict[str, Any] = {
-    "index": int,
-    "time": int | float | None,
-    "name": str,
-    "T_cam_obj": list,
-    "status": str,
-    "reason": str,
-    "confidence": int | float | None,
-    "losses": dict,
-    "diagnostics": dict,
-    "iterations": int,
-    "keyframe": bool,
-    "seconds": int | float | None,
-    "iou_initial": int | float | None,
-    "area": int,
-    "revision": bool,
-    "failure": str,
-    "hypothesis": str,
-    "refined": bool,
-    "stages": dict | None,
-    "mask_source": str | None,
-    "camera": list | None,
-    "free_axis": list | None,
-}
-_MOST = 2**53  # the largest count that every reader of JSON knows exactly
+
+def _number(value: Any) -> Any:
+    return math.nan if value is None else value
+
+
+def _pose(value: Any) -> NDArray[np.float64]:
+    try:
+        return np.array(value, dtype=np.float64).reshape(4, 4)
+    except TypeError as error:
+        raise ValueError("it is no matrix") from error
+
+
+def _stages(value: Any) -> StageTimes | None:
+    return None if value is None else read_stages(value)
+
+
+_Count = Annotated[int, Field(ge=0, le=2**53)]  # up to what every reader of JSON knows exactly
+_Number = Annotated[float, BeforeValidator(_number)]
+_Numbers = dict[str, _Number]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
     """The record of one frame in the run folder, without its masks."""
 
-    index: int  # the frame's index in the source
+    index: _Count  # the frame's index in the source
     time: float | None  # seconds since the start of the video, if known
     name: str  # what messages call the frame
     # (4, 4) float64 from object to camera; NaN if the estimate was not a number
-    T_cam_obj: NDArray[np.float64]
+    T_cam_obj: Annotated[NDArray[np.float64], PlainValidator(_pose)]
     status: Status  # the estimator's judgement
     reason: str  # why, in words
-    confidence: float  # in [0, 1]
+    confidence: _Number  # in [0, 1]
     # each loss term at the estimate, unweighted, by name; NaN if it was not a number
-    losses: dict[str, float]
-    iterations: int  # optimizer iterations spent
+    losses: _Numbers
+    iterations: _Count  # optimizer iterations spent
     keyframe: bool  # whether the frame became a keyframe
-    seconds: float  # wall time spent on the frame, all stages together; of a revision 0, see `latest`
+    seconds: _Number  # wall time spent on the frame, all stages together; of a revision 0, see `latest`
     iou_initial: float | None  # IoU of the estimate and the initial mask; None without an initial mask
-    area: int  # pixels of the estimated mask
+    area: _Count  # pixels of the estimated mask
     revision: bool = False  # whether this replaces an earlier estimate
     failure: str = ""  # which plug-in failed at this frame, and why; empty if none did
     hypothesis: str = ""  # the pose hypothesis that won, in a word or two; empty if there was only one
     refined: bool = False  # whether this is the estimate of the final refinement, not the causal one
-    stages: StageTimes | None = None  # the same time stage by stage; None in revisions
+    # the same time stage by stage; None in revisions
+    stages: Annotated[StageTimes | None, PlainValidator(_stages)] = None
     mask_source: MaskSource | None = None  # where the estimated mask comes from; None if unknown
     # fx, fy, cx, cy of the camera that the pose is of; None if it is the run's
     camera: tuple[float, float, float, float] | None = None
     # the other numbers behind status and confidence, by name; NaN if it was not a number
-    diagnostics: dict[str, float] = field(default_factory=dict)
+    diagnostics: _Numbers = field(default_factory=dict)
     # unit vector in object coordinates about which the rotation is not known; None if all of it is
     free_axis: tuple[float, float, float] | None = None
 
@@ -137,7 +133,7 @@ class FrameRecord:
         return bool(np.isfinite(self.T_cam_obj).all())
 
     @classmethod
-    def from_line(cls, line: bytes, file: Path) -> Self:
+    def from_line(cls, line: bytes, file: Path) -> FrameRecord:
         """Read one line of a file, with the nearest rotation if what it has is so only nearly.
 
         Raises:
@@ -151,41 +147,28 @@ class FrameRecord:
         return replace(record, T_cam_obj=T_cam_obj)
 
     @classmethod
-    def from_json(cls, line: str | bytes) -> Self:
+    def from_json(cls, line: str | bytes) -> FrameRecord:
         """Read one line.
 
         Raises:
             ValueError: If it is not a whole and valid record.
         """
         try:
-            fields = json.loads(line)
-            _check_kinds(fields)
-            fields["T_cam_obj"] = np.array(fields["T_cam_obj"], dtype=np.float64).reshape(4, 4)
-            fields["status"] = Status(fields["status"])
-            fields["confidence"] = _number(fields["confidence"])
-            fields["seconds"] = _number(fields["seconds"])
-            fields["losses"] = {term: _number(value) for term, value in fields["losses"].items()}
-            diagnostics = fields.get("diagnostics", {})
-            fields["diagnostics"] = {name: _number(value) for name, value in diagnostics.items()}
-            if (stages := fields.get("stages")) is not None:
-                fields["stages"] = read_stages(stages)
-            if (source := fields.get("mask_source")) is not None:
-                fields["mask_source"] = MaskSource(source)
-            if (camera := fields.get("camera")) is not None:
-                fx, fy, cx, cy = (float(value) for value in camera)
-                fields["camera"] = fx, fy, cx, cy
-            if (axis := fields.get("free_axis")) is not None:
-                x, y, z = (float(value) for value in axis)
-                fields["free_axis"] = x, y, z
-            return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
-        except KeyError as error:
-            raise ValueError(f"{error.args[0]} is missing") from error
-        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
-            raise ValueError(f"not a frame record: {error}") from error
+            return _LINE.validate_json(line, strict=True)
+        except ValidationError as error:
+            fault = error.errors(include_url=False)[0]
+            name = ".".join(map(str, fault["loc"]))
+            if not name:
+                raise ValueError(f"not a frame record: {fault['msg']}") from error
+            what = "missing" if fault["type"] == "missing" else f"{fault['input']!r:.40}"
+            raise ValueError(f"{name} is {what}") from error
 
     def to_json(self) -> str:
         """The record as one line of valid JSON; what is not a number is null."""
         return json.dumps(jsonable(vars(self)), allow_nan=False)
+
+
+_LINE = TypeAdapter(FrameRecord)
 
 
 def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRecord]:
@@ -237,22 +220,6 @@ def read_stages(value: Any) -> StageTimes:
         ValueError: If it is none.
     """
     try:
-        return StageTimes(**{stage: _number(seconds) for stage, seconds in value.items()})
+        return StageTimes(**{stage: float(_number(seconds)) for stage, seconds in value.items()})
     except (TypeError, AttributeError) as error:
         raise ValueError(f"{value!r:.40} are not stage times") from error
-
-
-def _check_kinds(fields: Any) -> None:
-    if not isinstance(fields, dict):
-        raise ValueError("it is not a JSON object")
-    for name, kind in _KINDS.items():
-        value = fields.get(name)
-        given = name in fields and (kind is bool or not isinstance(value, bool))
-        if name in fields and not (given and isinstance(value, kind)):
-            raise ValueError(f"{name} is {value!r:.40}")
-    if not all(0 <= fields[name] <= _MOST for name in ("index", "area", "iterations")):
-        raise ValueError("index, area or iterations is not a count")
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

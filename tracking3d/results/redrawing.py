@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import repeat
+
+import numpy as np
 
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.estimation.estimate import ObjectModel
@@ -16,28 +19,33 @@ from tracking3d.results.pictures import Pictures, kept_estimate
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import DEFAULT_FPS
 from tracking3d.video import open_source
+from tracking3d.video.image_file import read_image
 
 
 def redraw_contact_sheet(run: RunReader) -> None:
-    """Draw the contact sheet of a run again: with the crops of its overlay, and its model as it is now.
+    """Draw the contact sheet of a run again, with its model as it is now.
 
-    A run without an overlay, or that was killed, is left without change.
+    The crops are those of the present sheet, or if there is none of the overlay. A run without an overlay, or that was
+    killed, is left without change.
 
     Raises:
         InputError: If the run is damaged.
         OutputError: If it cannot be written.
     """
-    records, size = run.frames, OverlaySize.of(run.camera)
+    records, size, path = run.frames, OverlaySize.of(run.camera), run.folder / layout.CONTACT_SHEET
     positions, thumbnails = crop_positions(len(records)), Thumbnails()
-    for position, image in zip(positions, overlay_frames(run, positions), strict=False):
+    earlier, unseen = read_image(path) if path.is_file() else None, np.zeros((1, 1), bool)
+    images = overlay_frames(run, positions) if earlier is None else repeat(earlier)
+    for position, image in zip(positions, images, strict=False):
         record = records[position]
-        estimate = kept_estimate(record, run.mask(record.index), None, run.camera)
+        mask = run.mask(record.index) if earlier is None else unseen
+        estimate = kept_estimate(record, mask, None, run.camera)
         thumbnails.keep(image[: size.picture], size.scale, estimate)
     if thumbnails.kept and "counts" in run.description:
         replaced = {one.index for one in records if one.revision and not one.refined}
         crops = thumbnails.spread(CROPS)
-        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced)
-        write_image(run.folder / layout.CONTACT_SHEET, sheet)
+        sheet = draw_contact_sheet(crops, _model_of(run), run.description, replaced, earlier)
+        write_image(path, sheet)
 
 
 def redraw_overlay(run: RunReader, frames: Iterable[Frame]) -> None:

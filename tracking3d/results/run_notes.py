@@ -13,6 +13,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_reserved
 from tracking3d.results.records import jsonable
 from tracking3d.results.run_writer import RESERVE
+from tracking3d.runtime.memory import release_free_memory
 
 
 def note_in_run(folder: Path, about: Mapping[str, Any]) -> None:
@@ -29,6 +30,7 @@ def note_in_run(folder: Path, about: Mapping[str, Any]) -> None:
 @contextmanager
 def timed_pass(folder: Path, name: str) -> Iterator[None]:
     """Within is a pass of a run that has stopped; ``timings`` of its ``run.json`` gets the seconds that it takes."""
+    release_free_memory()
     began = time.monotonic()
     yield
     seconds = time.monotonic() - began

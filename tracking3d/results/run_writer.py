@@ -44,6 +44,7 @@ from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.runtime.concurrency import RegularWork
+from tracking3d.runtime.memory import release_free_memory
 
 FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0
@@ -127,6 +128,7 @@ class RunWriter:
     def begin_pass(self, name: str) -> None:
         """From here on time belongs to the pass ``name``."""
         self._passes, self._pass, self._pass_began = self.passes, name, time.monotonic()
+        release_free_memory()
 
     @property
     def lines(self) -> int:

@@ -43,7 +43,7 @@ class BackgroundAttempt(Generic[State, Item, Result]):
 
     def __init__(
         self,
-        attempt: Callable[[], tuple[State, list[Result]]],
+        attempt: Callable[[], tuple[State, Sequence[Result]]],
         catch_up: Callable[[State, Sequence[Item]], tuple[State, list[Result]]],
     ) -> None:
         self._attempt, self._catch_up = attempt, catch_up
@@ -85,7 +85,8 @@ class BackgroundAttempt(Generic[State, Item, Result]):
             self._done.set_exception(error)
 
     def _run(self) -> tuple[State, list[Result]]:
-        state, results = self._attempt()
+        state, found = self._attempt()
+        results = list(found)
         if not results:
             return state, []
         while some := self._take(more_than=_MAX_LEFT):

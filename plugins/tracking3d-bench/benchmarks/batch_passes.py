@@ -25,7 +25,7 @@ import faulty_trackers
 from machine_load import Load, measured_load
 from tracking3d.batch.folder import read_failures
 from tracking3d.batch.one_video import WORK
-from tracking3d.batch.running import Happening, run_batch
+from tracking3d.batch.running import BatchEvent, run_batch
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.choosing import open_engine
@@ -223,7 +223,7 @@ class _Pass:
         killed, stopped = False, False
         started, said = time.monotonic(), 0.0
 
-        def listener(happening: Happening) -> None:
+        def listener(happening: BatchEvent) -> None:
             nonlocal killed, said
             about, progress = happening.about, happening.progress
             if happening.event == "again":

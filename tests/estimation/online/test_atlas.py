@@ -12,6 +12,7 @@ from online_runs import estimate_of, final
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
+from tracking3d.estimation.online import tracker
 from tracking3d.estimation.online.atlas import (
     activate_largest_map,
     colours_match,
@@ -100,6 +101,16 @@ def rotation_errors(estimates) -> np.ndarray:
     found = np.stack([estimate.T_cam_obj[:3, :3] for estimate in seen])
     true = clip().T_cam_obj[[SHOWN[estimate.index] for estimate in seen], :3, :3]
     return aligned_rotation_errors(found, true)
+
+
+def test_while_an_object_stays_lost_frames_with_a_mask_are_searched_as_a_whole_at_intervals(monkeypatch):
+    (state, _), searched = run(FIRST), list[int]()
+    monkeypatch.setattr(tracker, "relocalize_in_frame", lambda *_: searched.append(state.lost_frames))
+    blank, mask = np.full_like(clip().images[0], 120), estimate_of(shown(FIRST - 1)[1])
+    for index in range(FIRST, FIRST + 17):
+        state, estimate = solver().step(state, Frame(index, blank), mask)
+    assert estimate.status is Status.LOST and state.lost_frames > 15
+    assert searched[-7:] == [1, 2, 3, 4, 5, 10, 15]
 
 
 def test_a_side_that_nobody_knows_is_tracked_anew_and_said_to_lie_there_by_a_guess():

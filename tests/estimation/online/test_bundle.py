@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
-from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damp, adjust
+from tracking3d.geometry.levenberg_marquardt import damped
+from tracking3d.points.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, adjust
 from tracking3d.points.bundle_adjustment.reprojection import transform_to_camera
 
 
@@ -103,8 +104,8 @@ def test_eliminating_the_points_gives_the_step_of_the_whole_system():
     system = problem(given).linearize(given.truth)
     size, count = len(system.poses), len(system.points)
     whole = np.zeros((size + 3 * count, size + 3 * count))
-    whole[:size, :size] = _damp(system.poses, 0.01)
-    for n, block in enumerate(_damp(system.points, 0.01)):
+    whole[:size, :size] = damped(system.poses, 0.01)
+    for n, block in enumerate(damped(system.points, 0.01)):
         rows = slice(size + 3 * n, size + 3 * n + 3)
         whole[rows, rows] = block
         whole[:size, rows] = system.coupling[n].T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from functools import cache
 
@@ -14,6 +15,7 @@ from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online import initializer
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.pending_frames import try_initialize
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays
@@ -47,15 +49,20 @@ def late_start(monkeypatch):
     monkeypatch.setattr(initializer, "try_initialize", wait)
 
 
+def run_to(last: int, solver: OnlineSolver) -> Run:
+    """The state and the estimates after the frames up to one."""
+    given = [(Frame(i, clip().images[i]), estimate_of(clip().masks[i])) for i in range(last + 1)]
+    state, estimate = solver.init(*given[0])
+    estimates = [estimate]
+    for frame, mask in given[1:]:
+        state, estimate = solver.step(state, frame, mask)
+        estimates.append(estimate)
+    return state, estimates
+
+
 def run_clip() -> Run:
     """The state at the end, and the final causal estimates."""
-    frames = [Frame(index, image) for index, image in enumerate(clip().images)]
-    masks = [estimate_of(mask) for mask in clip().masks]
-    state, estimate = small_solver().init(frames[0], masks[0])
-    estimates = [estimate]
-    for frame, mask in zip(frames[1:], masks[1:], strict=True):
-        state, estimate = small_solver().step(state, frame, mask)
-        estimates.append(estimate)
+    state, estimates = run_to(FRAMES - 1, small_solver())
     return state, final(estimates)
 
 
@@ -104,8 +111,13 @@ def test_without_them_the_last_frame_shows_hardly_a_landmark(monkeypatch):
     assert estimates[-1].diagnostics["inliers"] < 5
 
 
-def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted(monkeypatch):
-    again = 16
+AGAIN = 16
+"""The frame before which a plain map is restarted."""
+
+
+@pytest.fixture
+def plain_map(monkeypatch) -> None:
+    """The first map counts as one without points, and its restart finds the true rotations."""
 
     def without_points(*given, **options) -> tuple[SolverState, InitialMap | None]:
         state, start = try_initialize(*given, **options)
@@ -114,7 +126,7 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted(monkeypatch):
         return state, replace(start, object_map=replace(start.object_map, pointless=True))
 
     def restarted(state: SolverState, config: OnlineConfig) -> SolverState:
-        if state.last_pose[1] + 1 != again:
+        if state.last_pose[1] + 1 != AGAIN:
             return state
         assert state.revisable
         other = [replace(view, pose=exact(view.index, state)) for view in state.object_map.keyframes]
@@ -127,18 +139,47 @@ def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted(monkeypatch):
 
     monkeypatch.setattr(initializer, "try_initialize", without_points)
     monkeypatch.setattr(initializer, "restart_if_misfit", restarted)
-    frames = [Frame(index, image) for index, image in enumerate(clip().images[: again + 2])]
-    state, _ = small_solver().init(frames[0], estimate_of(clip().masks[0]))
-    answers = []
-    for frame, mask in zip(frames[1:], clip().masks[1:], strict=False):
-        state, estimate = small_solver().step(state, frame, estimate_of(mask))
-        answers.append(estimate)
-    at_once, *later = answers[again - 1 :]
-    assert [one.index for one in at_once.revised] == list(range(again))
+
+
+@pytest.mark.usefixtures("plain_map")
+def test_earlier_frames_get_the_poses_of_a_map_that_is_restarted():
+    state, answers = run_to(AGAIN + 1, small_solver())
+    at_once, *later = answers[AGAIN:]
+    assert [one.index for one in at_once.revised] == list(range(AGAIN))
+    assert all(one.probability is None for one in at_once.revised), "of all at once they take much memory"
     assert all(not one.revised for one in later)
     assert state.revisable == ()
     # Without points all keyframes have the contrast among their features, also those that came after the start.
     assert state.feature_space.contrast > 0
     assert {len(view.observation.features) for view in state.object_map.keyframes} == {4}
     assert state.surface.texture.shape[0] == 4
-    assert largest_error(final(answers[again - 1 : again])) < 10
+    assert largest_error(final(answers[AGAIN : AGAIN + 1])) < 10
+
+
+@pytest.mark.usefixtures("plain_map")
+def test_a_live_source_does_not_wait_for_a_restarted_map(monkeypatch):
+    restart, released, asked = initializer.restart_if_misfit, threading.Event(), []
+
+    def held(state: SolverState, config: OnlineConfig) -> SolverState:
+        asked.append(state.last_pose[1])
+        assert released.wait(120)
+        return restart(state, config)
+
+    def due(state: SolverState) -> bool:
+        return state.last_pose[1] + 1 == AGAIN
+
+    monkeypatch.setattr(initializer, "restart_if_misfit", held)
+    monkeypatch.setattr(initializer, "needs_restart", due)
+    monkeypatch.setattr(initializer, "_FIRST_WAIT", 120.0)  # the first map is not what is tested
+    solver = small_solver().for_live_source()
+    state, answers = run_to(AGAIN + 2, solver)
+    assert asked == [AGAIN - 1]
+    assert state.background is not None
+    assert not any(one.revised for one in answers[AGAIN:])
+    released.set()
+    state, late = solver.finish_background_work(state)
+    assert state.background is None
+    known = [*(one.index for one in late.revised), late.index]
+    assert known[:AGAIN] == list(range(AGAIN))
+    assert known[-1] == state.last_pose[1] == AGAIN + 2
+    assert largest_error(late.revised[:AGAIN]) < 10

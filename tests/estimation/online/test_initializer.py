@@ -290,6 +290,17 @@ def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked
     assert not asked["points"]
 
 
+def test_a_second_map_is_given_up_where_only_one_without_points_can_be_made(asked):
+    given = replace(belief_of(list(np.linspace(0, 60, 13))), needs_points=True)
+    plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)
+    state, start = try_initialize(replace(given, pending=plain), CONFIG)
+    assert start is None and not state.pending
+    asked["bundle"] = 0.6  # points that move, but not with one rigid object
+    state, start = try_initialize(given, CONFIG, ended=True)
+    assert start is None and not state.pending
+    assert not asked["turning"]
+
+
 def test_a_start_without_points_sees_the_contrast_of_small_marks(monkeypatch):
     given = belief_of(list(np.linspace(0, 60, 13)))
     plain = tuple((replace(view, strength=0.1), estimate) for view, estimate in given.pending)

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from online_runs import estimate_of, frame, solver, true_mask, turning_clip
+from online_runs import estimate_of, frame, known_run, solver, true_mask, turning_clip
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.features.klt import grey
@@ -134,7 +134,9 @@ def test_a_photo_that_shows_too_little_is_named_with_its_neighbours():
 
 
 @pytest.mark.parametrize("plain", [True, False])
-def test_photos_of_a_plain_object_are_not_blamed_for_their_steps(plain):
+def test_photos_of_a_plain_object_are_not_blamed_for_their_steps(plain, monkeypatch):
+    matched = list[bool]()
+    monkeypatch.setattr(photo_start, "match_photos", lambda *_: matched.append(True) or {})
     flat = np.full_like(turning_clip().images[0], 120)
     photos = {n: Frame(n, flat) if plain else frame(4 * n) for n in range(4)}
     photo_set = PhotoSet(
@@ -142,9 +144,17 @@ def test_photos_of_a_plain_object_are_not_blamed_for_their_steps(plain):
     )
     state, _ = solver().init(photos[0], estimate_of(true_mask(0)))
     state, found = solver().start_from_photos(state, photo_set)
-    assert ("hardly any texture" in found.reason) is plain
+    assert ("hardly any texture" in found.reason) is plain is not bool(matched)
     if plain:
         assert not found.estimates and state.waiting_reason == found.reason
+
+
+def test_what_is_known_to_be_plain_is_not_looked_at_as_photos():
+    state, _ = known_run(12)
+    views = tuple(replace(view, strength=0.1) for view in state.object_map.keyframes)
+    plain = replace(state, object_map=replace(state.object_map, keyframes=views, pointless=True))
+    same, found = solver().start_from_photos(plain, PhotoSet((0, 1), lambda _: pytest.fail("read in vain")))
+    assert same is plain and "hardly any texture" in found.reason
 
 
 def test_photos_too_far_apart_are_not_joined_and_no_motion_is_asked_for():

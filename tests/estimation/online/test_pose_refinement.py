@@ -289,7 +289,7 @@ def test_points_at_half_the_resolution_are_the_same_points():
 
 
 def test_at_half_the_resolution_scales_are_half_as_many_pixels():
-    half = _Evidence(FRAME, matched(), PoseWeights(outline_scale=3.0, points_scale=5.0)).half()
+    half = _Evidence(SURFACE, FRAME, matched(), PoseWeights(outline_scale=3.0, points_scale=5.0)).half()
     assert (half.weights.outline_scale, half.weights.points_scale) == (1.5, 2.5)
     assert half.observation.window.size == SIZE // 2
     assert half.matched is not None

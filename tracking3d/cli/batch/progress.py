@@ -18,7 +18,7 @@ from tracking3d.batch.folder import BatchProgress as HowFar
 from tracking3d.cli.progress import duration_in_words
 
 if TYPE_CHECKING:
-    from tracking3d.batch.running import Happening, Listener
+    from tracking3d.batch.running import BatchEvent, Listener
 
 _MOST_WORKERS = 32
 """Most lines of workers on the terminal."""
@@ -50,7 +50,7 @@ def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
     every = bars.add_task("all", total=None, said="")
     lines: dict[str, TaskID] = {}
 
-    def listener(happening: Happening) -> None:
+    def listener(happening: BatchEvent) -> None:
         how_far = happening.progress
         done = how_far.finished + how_far.failed
         bars.update(every, total=how_far.total, complete=done, said=in_words(how_far))
@@ -87,7 +87,7 @@ def in_words(progress: HowFar) -> str:
     return ", ".join(parts)
 
 
-def _line(happening: Happening) -> str:
+def _line(happening: BatchEvent) -> str:
     about, video = happening.about, happening.video
     if happening.event == "finished":
         rows = about["rows"]
@@ -109,7 +109,7 @@ def _line(happening: Happening) -> str:
 def _events() -> Listener:
     last: dict[str, float] = {}
 
-    def listener(happening: Happening) -> None:
+    def listener(happening: BatchEvent) -> None:
         now = time.monotonic()
         if happening.event == "progress":
             if now - last.get(happening.video, 0.0) < _EVERY:

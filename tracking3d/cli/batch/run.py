@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -98,26 +98,22 @@ JsonEvents = Annotated[
 class EngineOptions:
     """Where the videos are tracked, and with what resources."""
 
+    PANEL: ClassVar = PERFORMANCE
+
     workers: Annotated[
         int | None,
         typer.Option(
-            metavar="N",
-            min=1,
-            max=100_000,
-            help="Videos tracked at the same time; default one per core.",
-            rich_help_panel=PERFORMANCE,
+            metavar="N", min=1, max=100_000, help="Videos tracked at the same time; default one per core."
         ),
     ] = None
     address: Address = None
     threads: Annotated[
         int,
-        typer.Option(metavar="N", min=1, max=256, help="Cores for each video.", rich_help_panel=PERFORMANCE),
+        typer.Option(metavar="N", min=1, max=256, help="Cores for each video."),
     ] = 1
     memory: Annotated[
         int | None,
-        typer.Option(
-            metavar="MB", min=1, help="Memory reserved for each video.", rich_help_panel=PERFORMANCE
-        ),
+        typer.Option(metavar="MB", min=1, help="Memory reserved for each video."),
     ] = None
 
 
@@ -162,7 +158,7 @@ def run(
     from tracking3d.batch.listing import dataset_jobs, list_jobs
 
     if split is not None:
-        _check_split(split, config, out, data, engine.address)
+        _check_split(config, out, data, engine.address)
     if data is not None:
         from tracking3d.batch.datasets import dataset_reader
 
@@ -210,7 +206,6 @@ def _check_prompts(jobs: str, videos: Sequence[VideoJob], quiet: bool) -> None:
         InputError: None of them has one.
     """
     from tracking3d.batch.listing import NO_PROMPT
-    from tracking3d.errors import InputError
 
     missing = [video for video in videos if video.fault == NO_PROMPT]
     if not missing:
@@ -240,9 +235,7 @@ def _needs(videos: Sequence[VideoJob], engine: EngineOptions) -> Needs:
     return Needs(engine.threads, engine.memory or 0.0, 1.0 if gpus else 0.0)
 
 
-def _check_split(
-    split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
-) -> None:
+def _check_split(settings: PipelineConfig, out: str, data: Path | None, address: str | None) -> None:
     from tracking3d.batch.storage import local
     from tracking3d.pipeline.submaps.job import refuse_what_cannot_be_joined
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
+from pydantic.fields import FieldInfo
+from typer.models import OptionInfo
 
+from tracking3d.config.models import OnlineConfig, PipelineConfig, PromptSection
 from tracking3d.errors import InputError
 
 PROMPT = "Prompt"
@@ -22,6 +26,8 @@ CAMERA = "Camera"
 SETTINGS = "Settings"
 OUTPUT = "Output"
 PERFORMANCE = "Performance"
+
+_PROMPT = FieldInfo(annotation=PromptSection)  # the section that only `run` reads
 
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
@@ -49,6 +55,39 @@ Sequences = Annotated[
         rich_help_panel=DATA,
     ),
 ]
+
+
+class KeyOption(OptionInfo):
+    """An option that sets a key of the configuration, whose description begins with the help of the option.
+
+    Args:
+        path: ``section.key``, or the section alone where its plug-in is chosen.
+        metavar: What stands for the value in the help.
+        names: Names of the option, if the parameter does not have its name.
+        more: Further arguments of typer's `Option`.
+    """
+
+    def __init__(self, path: str, metavar: str | None = None, *names: str, **more: Any) -> None:
+        self.section, _, self.key = path.partition(".")
+        field = PipelineConfig.model_fields.get(self.section, _PROMPT)
+        if self.key:
+            model = OnlineConfig if self.section == "solver" else field.annotation
+            field = model.model_fields[self.key]  # type: ignore[union-attr] # sections are models
+        sentence = (field.description or "").partition(". ")[0].rstrip(".")
+        super().__init__(default=..., param_decls=names, metavar=metavar, help=f"{sentence}.", **more)
+
+
+def settings_of(*groups: Any) -> dict[str, Any]:
+    """What the settings among the options of groups give, by section and key; None where an option is left out."""
+    given: dict[str, Any] = {}
+    for group in groups:
+        for name, hint in get_type_hints(type(group), include_extras=True).items():
+            for option in get_args(hint):
+                if isinstance(option, KeyOption) and option.key:
+                    given.setdefault(option.section, {})[option.key] = getattr(group, name)
+                elif isinstance(option, KeyOption):
+                    given[option.section] = getattr(group, name)
+    return given
 
 
 def numbers(text: str, count: int, option: str, form: str) -> tuple[float, ...]:
@@ -107,7 +146,8 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """Make a command that typer understands of one that takes groups of options.
 
     Args:
-        command: A function whose parameters are options, or dataclasses whose fields are ``Annotated`` options.
+        command: A function whose parameters are options, or dataclasses whose fields are ``Annotated`` options; the
+            class variable ``PANEL`` of such a group is the heading in the help of those that name none.
 
     Returns:
         The command with one parameter per option. It builds the groups and calls ``command``.
@@ -142,7 +182,11 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def _field_parameters(group: type) -> Iterator[inspect.Parameter]:
     hints = get_type_hints(group, include_extras=True)
     for field in fields(group):
+        kind, option = get_args(hints[field.name])
+        option = copy(option)
+        option.rich_help_panel = option.rich_help_panel or getattr(group, "PANEL", None)
         default = inspect.Parameter.empty if field.default is MISSING else field.default
+        annotation = Annotated.__class_getitem__((kind, option))  # type: ignore[attr-defined]
         yield inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[field.name]
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
         )

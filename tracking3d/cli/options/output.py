@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import OUTPUT, PERFORMANCE
+from tracking3d.cli.options.general import OUTPUT, PERFORMANCE, KeyOption
 from tracking3d.errors import InputError
 
 
@@ -20,25 +20,14 @@ def _check(value: float | None) -> float | None:
 
 ObjectSize = Annotated[
     float | None,
-    typer.Option(
-        "--object-size",
-        metavar="METRES",
-        callback=_check,
-        help="Length of the object's longest side; all lengths are then in metres.",
-        rich_help_panel=OUTPUT,
-    ),
+    KeyOption("object.size", "METRES", "--object-size", callback=_check, rich_help_panel=OUTPUT),
 ]
-
-
 RunFolder = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="Run folder; default runs/<source>.", rich_help_panel=OUTPUT),
 ]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace an earlier run in that folder.", rich_help_panel=OUTPUT)
-]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Continue the stopped run in that folder.", rich_help_panel=OUTPUT)
 ]
 Report = Annotated[
     bool,
@@ -48,10 +37,6 @@ Report = Annotated[
         show_default=False,
         rich_help_panel=OUTPUT,
     ),
-]
-View = Annotated[
-    bool,
-    typer.Option("--view", help="Show the run in the browser while it is tracked.", rich_help_panel=OUTPUT),
 ]
 Host = Annotated[
     str | None,
@@ -69,18 +54,39 @@ Browser = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+Port = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        max=65535,
+        help="Port, or the next free one above it; 0 for any free port.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+Address = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local to start Ray on this machine.",
+        rich_help_panel=PERFORMANCE,
+    ),
+]
 
 
 @dataclass(frozen=True)
 class OutputOptions:
     """What is written and shown."""
 
+    PANEL: ClassVar = OUTPUT
+
     out: RunFolder = None
     overwrite: Overwrite = False
-    resume: Resume = False
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the stopped run in that folder.")] = False
     object_size: ObjectSize = None
     report: Report = True
-    view: View = False
+    view: Annotated[bool, typer.Option("--view", help="Show the run in the browser while it is tracked.")] = (
+        False
+    )
     host: Host = None
 
     def check(self) -> None:
@@ -97,53 +103,27 @@ class OutputOptions:
             raise InputError("--host is the address that --view serves its page on; add --view.")
 
 
-Size = Annotated[
-    int | None,
-    typer.Option(
-        metavar="PIXELS",
-        help="Working resolution: side of the square crop around the object.",
-        rich_help_panel=PERFORMANCE,
-    ),
-]
-Device = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Device: cpu, cuda or cuda:N.", rich_help_panel=PERFORMANCE),
-]
-Split = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="Cut a long video into parts of about this length, track them in parallel, and merge the results.",
-        rich_help_panel=PERFORMANCE,
-    ),
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Parts of --split tracked at the same time; default one per processor.",
-        rich_help_panel=PERFORMANCE,
-    ),
-]
-
-Address = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local to start Ray on this machine.",
-        rich_help_panel=PERFORMANCE,
-    ),
-]
-
-
 @dataclass(frozen=True)
 class PerformanceOptions:
     """Resolution, device and parallel parts."""
 
-    size: Size = None
-    device: Device = None
-    split: Split = None
-    workers: Workers = None
+    PANEL: ClassVar = PERFORMANCE
+
+    size: Annotated[int | None, KeyOption("crop.size", "PIXELS")] = None
+    device: Annotated[str | None, KeyOption("runtime.device", "NAME")] = None
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Cut a long video into parts of about this length, track them in parallel, and merge the results.",
+        ),
+    ] = None
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="Parts of --split tracked at the same time; default one per processor."
+        ),
+    ] = None
 
     def check(self) -> None:
         """Make sure that the options go together.

@@ -4,104 +4,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import PROMPT
+from tracking3d.cli.options.general import PROMPT, KeyOption
 from tracking3d.errors import InputError
 
-Box = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="X,Y,W,H|FILE",
-        help="Box around the object in the first frame, in pixels, or a file in VOT's region format; repeat for "
-        "several objects.",
-        rich_help_panel=PROMPT,
-    ),
-]
-BoxFormat = Annotated[
-    str | None,
-    typer.Option(
-        metavar="xywh|xyxy",
-        help="How boxes are written: X,Y,WIDTH,HEIGHT, the default, or X1,Y1,X2,Y2.",
-        rich_help_panel=PROMPT,
-    ),
-]
-Mask = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="FILE[@N|@all]",
-        help="Mask image of the object in the first frame; @N picks object N of an indexed image. Repeat for several "
-        "objects.",
-        rich_help_panel=PROMPT,
-    ),
-]
-Points = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="'X,Y+ X,Y-'",
-        help="Points in the first frame, + on the object and - on the background; repeat for several objects.",
-        rich_help_panel=PROMPT,
-    ),
-]
-Masks = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR|FILE[@N]",
-        help="Masks of all frames: a folder, video, .npz, COCO .json or VOT .txt. The first mask is the prompt. "
-        "Images with alpha bring their own.",
-        rich_help_panel=PROMPT,
-    ),
-]
-KnownObject = Annotated[
-    str | None,
-    typer.Option(
-        "--object",
-        metavar="RUN|MESH",
-        help="Known object: an earlier run or a mesh file. A box or mask is optional then.",
-        rich_help_panel=PROMPT,
-    ),
-]
-Extend = Annotated[
-    bool,
-    typer.Option(
-        "--extend",
-        help="Track the object by itself, and make its model from this video and that of --object RUN.",
-        rich_help_panel=PROMPT,
-    ),
-]
-StartFrame = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Frame of the prompt, if not the first; tracking runs forwards and backwards from it.",
-        rich_help_panel=PROMPT,
-    ),
-]
-Correct = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="FRAME:BOX|MASK|POINTS",
-        help="Prompt in a later frame; the mask tracker restarts from it. May be repeated.",
-        rich_help_panel=PROMPT,
-    ),
-]
+BoxFormat = Annotated[str | None, KeyOption("prompt.box_format", "xywh|xyxy", rich_help_panel=PROMPT)]
 
 
 @dataclass(frozen=True)
 class PromptOptions:
     """What the objects are: at most one of ``box``, ``mask`` and ``points``, or what makes them unnecessary."""
 
-    box: Box = None
+    PANEL: ClassVar = PROMPT
+
+    box: Annotated[list[str] | None, KeyOption("prompt.box", "X,Y,W,H|FILE")] = None
     box_format: BoxFormat = None
-    mask: Mask = None
-    points: Points = None
-    masks: Masks = None
-    known: KnownObject = None
-    extend: Extend = False
-    start_frame: StartFrame = None
-    correct: Correct = None
+    mask: Annotated[list[Path] | None, KeyOption("prompt.mask", "FILE[@N|@all]")] = None
+    points: Annotated[list[str] | None, KeyOption("prompt.points", "'X,Y+ X,Y-'")] = None
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR|FILE[@N]",
+            help="Masks of all frames: a folder, video, .npz, COCO .json or VOT .txt. The first mask is the prompt. "
+            "Images with alpha bring their own.",
+        ),
+    ] = None
+    known: Annotated[
+        str | None,
+        typer.Option(
+            "--object",
+            metavar="RUN|MESH",
+            help="Known object: an earlier run or a mesh file. A box or mask is optional then.",
+        ),
+    ] = None
+    extend: Annotated[
+        bool,
+        typer.Option(
+            "--extend",
+            help="Track the object by itself, and make its model from this video and that of --object RUN.",
+        ),
+    ] = False
+    start_frame: Annotated[int | None, KeyOption("prompt.start_frame", "N")] = None
+    correct: Annotated[list[str] | None, KeyOption("prompt.correct", "FRAME:BOX|MASK|POINTS")] = None
 
     def completed_from(self, config: Path | None) -> PromptOptions:
         """The same, with what the section ``prompt`` of a configuration file gives if the options do not.

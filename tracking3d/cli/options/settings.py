@@ -91,8 +91,7 @@ def configure(
     plugin_label(FEATURES, config.features.name)
     check_tracker_options(config)
     check_options(FEATURES, config.features)
-    if config.keypoints.name != "sift":
-        check_options(KEYPOINTS, config.keypoints)
+    check_options(KEYPOINTS, config.keypoints)
     return config
 
 

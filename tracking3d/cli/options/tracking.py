@@ -4,78 +4,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import typer
 
-from tracking3d.cli.options.general import CAMERA, TRACKING, VIDEO, numbers
+from tracking3d.cli.options.general import CAMERA, TRACKING, VIDEO, KeyOption, numbers
 from tracking3d.errors import InputError
 
-Tracker = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Mask tracker; `tracking3d plugins` lists them. auto takes the best one at hand.",
-        show_default="auto",
-        rich_help_panel=TRACKING,
-    ),
-]
-Features = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Feature encoder.", rich_help_panel=TRACKING)
-]
-Flat = Annotated[
-    bool, typer.Option("--flat", help="The object is planar, like a card.", rich_help_panel=TRACKING)
-]
-TrustMasks = Annotated[
-    bool,
-    typer.Option(
-        "--trust-masks",
-        help="The masks of all frames (--masks) are right, for example drawn by hand: keep them.",
-        rich_help_panel=TRACKING,
-    ),
-]
-Prototype = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME|MESH",
-        help="Initial shape: sphere, ellipsoid or a mesh file.",
-        rich_help_panel=TRACKING,
-    ),
-]
-FinalRefine = Annotated[
-    bool | None,
-    typer.Option(
-        "--final-refine/--no-final-refine",
-        help="After the last frame, re-estimate every frame with the final model; causal estimates are kept too.",
-        show_default=False,
-        rich_help_panel=TRACKING,
-    ),
-]
-OnPluginFailure = Annotated[
-    str | None,
-    typer.Option(
-        metavar="continue|stop",
-        help="If a plug-in fails after the first frame: continue with the last mask, or stop.",
-        rich_help_panel=TRACKING,
-    ),
-]
-Seed = Annotated[
-    int | None, typer.Option(metavar="N", help="Random seed of the run.", rich_help_panel=TRACKING)
-]
+Tracker = Annotated[str | None, KeyOption("tracker", "NAME", show_default="auto", rich_help_panel=TRACKING)]
+Features = Annotated[str | None, KeyOption("features", "NAME", rich_help_panel=TRACKING)]
 
 
 @dataclass(frozen=True)
 class TrackingOptions:
     """How the object is tracked."""
 
+    PANEL: ClassVar = TRACKING
+
     tracker: Tracker = None
     features: Features = None
-    flat: Flat = False
-    trust_masks: TrustMasks = False
-    prototype: Prototype = None
-    final_refine: FinalRefine = None
-    on_plugin_failure: OnPluginFailure = None
-    seed: Seed = None
+    flat: Annotated[bool | None, KeyOption("object.flat", None, "--flat")] = None
+    trust_masks: Annotated[bool | None, KeyOption("object.trust_masks", None, "--trust-masks")] = None
+    prototype: Annotated[str | None, KeyOption("object.prototype", "NAME|MESH")] = None
+    final_refine: Annotated[
+        bool | None,
+        KeyOption("solver.final_refine", None, "--final-refine/--no-final-refine", show_default=False),
+    ] = None
+    on_plugin_failure: Annotated[str | None, KeyOption("runtime.on_plugin_failure", "continue|stop")] = None
+    seed: Annotated[int | None, KeyOption("runtime.seed", "N")] = None
 
     def tracker_settings(self, masks: Path | None) -> dict[str, str | int | None]:
         """The section ``tracker`` of the configuration.
@@ -113,68 +69,40 @@ Frames = Annotated[
         rich_help_panel=VIDEO,
     ),
 ]
-Fps = Annotated[
-    float | None,
-    typer.Option(metavar="NUMBER", help="Frame rate of an image folder or pattern.", rich_help_panel=VIDEO),
-]
-SkipDamaged = Annotated[
-    bool,
-    typer.Option(
-        "--skip-damaged",
-        help="If the first frame cannot be decoded, apply the prompt to the first frame that can.",
-        rich_help_panel=VIDEO,
-    ),
-]
 
 
 @dataclass(frozen=True)
 class VideoOptions:
     """Which frames are read, and how."""
 
+    PANEL: ClassVar = VIDEO
+
     frames: Frames = None
-    fps: Fps = None
-    skip_damaged: SkipDamaged = False
-
-
-Fov = Annotated[
-    float | None,
-    typer.Option(metavar="DEGREES", help="Vertical field of view in degrees.", rich_help_panel=CAMERA),
-]
-Intrinsics = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FX,FY,CX,CY",
-        help="Focal lengths and principal point, in pixels of the full frame.",
-        rich_help_panel=CAMERA,
-    ),
-]
-Distortion = Annotated[
-    str | None,
-    typer.Option(
-        metavar="K1,K2,P1,P2,...",
-        help="Lens distortion coefficients in OpenCV's order; fisheye:K1,K2,K3,K4 for a fisheye lens.",
-        rich_help_panel=CAMERA,
-    ),
-]
-CameraFile = Annotated[
-    str | None,
-    typer.Option(
-        "--camera",
-        metavar="FILE",
-        help="Camera file with intrinsics and distortion: YAML of OpenCV, ROS or Kalibr, or COLMAP's cameras.txt.",
-        rich_help_panel=CAMERA,
-    ),
-]
+    fps: Annotated[
+        float | None,
+        typer.Option(metavar="NUMBER", help="Frame rate of an image folder or pattern."),
+    ] = None
+    skip_damaged: Annotated[
+        bool,
+        typer.Option(
+            "--skip-damaged",
+            help="If the first frame cannot be decoded, apply the prompt to the first frame that can.",
+        ),
+    ] = False
 
 
 @dataclass(frozen=True)
 class CameraOptions:
     """Intrinsics and distortion; the camera is estimated or assumed if none is given."""
 
-    fov: Fov = None
-    intrinsics: Intrinsics = None
-    distortion: Distortion = None
-    camera_file: CameraFile = None
+    PANEL: ClassVar = CAMERA
+
+    fov: Annotated[float | None, KeyOption("camera.fov", "DEGREES")] = None
+    intrinsics: Annotated[str | None, KeyOption("camera.intrinsics", "FX,FY,CX,CY")] = None
+    distortion: Annotated[
+        str | None, KeyOption("camera.distortion", "K1,K2,P1,P2,...|fisheye:K1,K2,K3,K4")
+    ] = None
+    camera_file: Annotated[str | None, KeyOption("camera.file", "FILE", "--camera")] = None
 
     def settings(self) -> dict[str, Any]:
         """The section ``camera`` of the configuration.

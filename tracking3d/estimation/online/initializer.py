@@ -6,7 +6,7 @@ thread, and frames that come meanwhile are estimated when it is done.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -186,17 +186,30 @@ class Initializer:
 
     def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
         """See `tracking3d.estimation.solver.RefiningSolver`; an attempt that has failed is given up."""
-        if isinstance(state, Mapped) or (begun := state.background) is None or not begun.is_done(wait=None):
+        if (begun := state.background) is None or not begun.is_done(wait=None):
             return state, None
         return (replace(state, background=None), None) if begun.has_failed else self._adopt(state, begun)
 
     def restart_if_misfit(self, state: Mapped) -> tuple[Mapped, tuple[FrameEstimate, ...]]:
         """The state before the next frame, and new estimates of earlier ones if its map is restarted.
 
-        See `restart_if_misfit`. A live source would wait for seconds, so there it stays.
+        See `restart_if_misfit`. That takes seconds: for a live source it is done in another thread, and frames are
+        estimated with the present map meanwhile.
         """
-        if self.in_background:
+        if not self.in_background:
+            return self._restart(state)
+        begun = state.background
+        if begun is None and not needs_restart(state):
             return state, ()
+        begun = begun or self._in_background(state, lambda: self._restart(state))
+        if not begun.is_done():
+            return replace(state, background=begun), ()
+        updated, found = self._adopt(state, begun)
+        assert isinstance(updated, Mapped)  # a map never becomes none
+        return updated, () if found is None else (*found.revised, replace(found, revised=()))
+
+    def _restart(self, state: Mapped) -> tuple[Mapped, tuple[FrameEstimate, ...]]:
+        """See `restart_if_misfit`."""
         with in_stage("map"):
             updated = restart_if_misfit(state, self.options)
             if updated.object_map is state.object_map or not state.revisable:
@@ -216,6 +229,9 @@ class Initializer:
     def join_photos(self, state: SolverState, photos: PhotoSet) -> tuple[SolverState, PhotoEstimates]:
         """See `tracking3d.estimation.solver.RefiningSolver.start_from_photos`."""
         observer, camera = self.observer, self.observer.camera
+        known = [view.strength for view in state.object_map.keyframes if view.strength < np.inf]
+        if state.object_map.pointless and known and not has_texture(known):
+            return state, PhotoEstimates((), _PLAIN)
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
@@ -233,9 +249,10 @@ class Initializer:
             waiting.append((view, initial_estimate(frame, binary, pose, camera)))
             found.append(Photo.of(frame.index, grey(frame.image), binary, observer.detector))
             strengths.append(texture_strength(grey(frame.image), binary))
-        start = start_of_photos(found, camera)
-        if begun is None or start.structure is None:
-            reason = start.reason if has_texture(strengths) or not found else _PLAIN
+        plain = bool(found) and not has_texture(strengths)  # no pair of photos is worth matching
+        start = None if plain else start_of_photos(found, camera)
+        if begun is None or start is None or start.structure is None:
+            reason = _PLAIN if start is None else start.reason
             if isinstance(state, Initializing):
                 state = replace(state, waiting_reason=reason)
             return state, PhotoEstimates((), reason)
@@ -280,7 +297,7 @@ class Initializer:
                 state.feature_space,
                 state.extended,
                 surface=object_map.surface(),
-                revisable=waiting if start.object_map.pointless and not self.in_background else (),
+                revisable=waiting if start.object_map.pointless else (),
             )
             updated = refine_by_landmarks(updated, self.options)
             if self.observer.config.has_given_masks:
@@ -296,30 +313,39 @@ class Initializer:
         begun, newest, wait = state.background, state.pending[-1], 0.0
         if begun is None:
 
-            def attempt() -> tuple[SolverState, list[FrameEstimate]]:
+            def attempt() -> tuple[SolverState, Sequence[FrameEstimate]]:
                 tried, found = self._try(state)
-                return tried, [] if found is None else [*found.revised, found]
+                return tried, () if found is None else (*found.revised, found)
 
-            def arrived(
-                made: SolverState, frames: Sequence[Pending]
-            ) -> tuple[SolverState, list[FrameEstimate]]:
-                assert isinstance(made, Mapped)  # there are estimates
-                return self._estimate_arrived(made, frames, state.camera)
-
-            begun, wait = BackgroundAttempt(attempt, arrived), _FIRST_WAIT
+            begun, wait = self._in_background(state, attempt), _FIRST_WAIT
         else:
             begun.add(newest)
         if begun.is_done(wait):
             return self._adopt(state, begun)
         return replace(state, background=begun), replace(newest[1], reason=_IN_PROGRESS)
 
+    def _in_background(
+        self, state: SolverState, attempt: Callable[[], tuple[SolverState, Sequence[FrameEstimate]]]
+    ) -> BackgroundAttempt[SolverState, Pending, FrameEstimate]:
+        """Make a map in another thread, which then estimates the frames that arrived meanwhile."""
+
+        def arrived(made: SolverState, frames: Sequence[Pending]) -> tuple[SolverState, list[FrameEstimate]]:
+            assert isinstance(made, Mapped)  # there are estimates
+            return self._estimate_arrived(made, frames, state.camera)
+
+        return BackgroundAttempt(attempt, arrived)
+
     def _adopt(
-        self, state: Initializing, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
+        self, state: SolverState, begun: BackgroundAttempt[SolverState, Pending, FrameEstimate]
     ) -> tuple[SolverState, FrameEstimate | None]:
-        """The state with what came of an initialization, as if no frame had come meanwhile."""
+        """The state with the map that was made in another thread, as if no frame had come meanwhile."""
         outcome = begun.outcome()
         found, estimates = outcome.state, outcome.results
-        if isinstance(found, Initializing):
+        if isinstance(state, Mapped):
+            assert isinstance(found, Mapped)  # the outcome of a restart
+            if not estimates or found.active_since != state.active_since:  # or another map took its place
+                return replace(state, background=None, misfits=0, restarts=found.restarts), None
+        elif isinstance(found, Initializing):
             at_rest = found.object_map.started_at_rest
             return replace(
                 found,
@@ -329,6 +355,7 @@ class Initializer:
                 tracked_points=state.tracked_points,
                 pending=(*found.pending, *outcome.left),
             ), None
+        assert isinstance(found, Mapped)  # there are estimates
         if outcome.left:
             found, more = self._estimate_arrived(found, outcome.left, state.camera)
             estimates = [*estimates, *more]
@@ -415,8 +442,10 @@ class Initializer:
             if all(view.index != other.index for other in state.object_map.keyframes):
                 shown = resect_pose(state.object_map, state.camera, view, pose)
                 estimate = replace(estimate, T_cam_obj=shown.matrix().numpy())
+            state = learn_colours(state, estimate, found)
+            if not self.observer.config.runtime.probabilities:  # of all frames at once they take much memory
+                estimate = replace(estimate, probability=None)
             revised.append(estimate)
-            state = learn_colours(state, revised[-1], found)
         if not trail:
             return state, revised, trail
         return replace(
@@ -425,13 +454,18 @@ class Initializer:
         ), revised, trail  # fmt: skip
 
 
+def needs_restart(state: Mapped) -> bool:
+    """Whether the map has explained the last frames badly for long, and may be restarted once more."""
+    known = state.object_map.fixed_keyframes > 0
+    return not known and state.misfits >= _LASTING_MISFIT and state.restarts < _MOST_RESTARTS
+
+
 def restart_if_misfit(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state before the next frame, its map restarted if that has explained the last frames badly for long.
 
     It is tried `_MOST_RESTARTS` times at most. The object is then tracked on from the newest keyframe.
     """
-    known = state.object_map.fixed_keyframes > 0
-    if known or state.misfits < _LASTING_MISFIT or state.restarts >= _MOST_RESTARTS:
+    if not needs_restart(state):
         return state
     restarts = state.restarts + 1
     again = state.revisable if restarts < _MOST_RESTARTS else ()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig, PipelineConfig
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, without_masks
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online import atlas, refiner
 from tracking3d.estimation.online.features.klt import FollowedPoints, carry, follow, grey
@@ -168,6 +168,8 @@ class OnlineSolver:
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
         if state.revisable:
             updated = replace(updated, revisable=thin_out((*state.revisable, (found.view, plain))))
+        if state.background is not None:
+            state.background.add((found.view, plain))
         if not (found.doubtful if state.object_map.pointless else found.lost):
             updated = replace(updated, reinitialization=None)
         if not (found.lost or is_keyframe):
@@ -209,7 +211,7 @@ class OnlineSolver:
             if not atlas.is_fully_visible(mask) or not atlas.colours_match(state, frame, mask):
                 return replace(state, reinitialization=None), estimate
             begun, _ = self.initializer.begin(frame, mask, state.camera, state.feature_space)
-            return replace(state, reinitialization=begun), estimate
+            return replace(state, reinitialization=replace(begun, needs_points=True)), estimate
         second, again = self.initializer.add(begun, frame, image, mask)
         if isinstance(second, Initializing):
             return replace(state, reinitialization=second), estimate
@@ -316,7 +318,7 @@ class OnlineSolver:
         for frame, mask in gap.frames:
             shown = replace(frame, index=number + abs(frame.index - gap.anchor.index))
             state, estimate = self._track(state, shown, grey(frame.image), mask.found, options)
-            estimates.append(replace(estimate, index=frame.index))
+            estimates.append(replace(without_masks(estimate), index=frame.index))
         return replace(refiner.leave_gap(state, gap, number), inactive_maps=aside), estimates
 
     end_extension = staticmethod(refiner.end_extension)

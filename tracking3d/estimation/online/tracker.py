@@ -73,7 +73,8 @@ class Tracker:
     ) -> PoseCandidate:
         """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful.
 
-        A doubtful frame that is looked at again was searched as a whole before; only a lost one is once more.
+        A doubtful frame that is looked at again was searched as a whole before; only a lost one is once more. While the
+        object stays lost, frames with a mask are searched as a whole at intervals.
         """
         object_map, camera = state.object_map, state.camera
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
@@ -94,7 +95,8 @@ class Tracker:
             fit = replace(fit, pose=object_map.free_axis.untwisted(fit.pose, state.last_pose[0]))
         best = PoseCandidate(view, fit, won, kept, support, assessment)
         unsure = best.doubtful and best.evidence.inliers < _MOST_ELSEWHERE
-        if best.lost or (unsure and not again and should_retry(state.doubtful_frames)):
+        waited = state.lost_frames if best.lost else state.doubtful_frames
+        if (best.lost or (unsure and not again)) and should_retry(waited):
             other = self._elsewhere(state, frame, image, view.mask)
             return other if other is not None and other.better_than(best) else best
         return best

@@ -126,7 +126,10 @@ class VideoSegmenter:
     def see(self, frame: ObjectView) -> None:
         """A frame for the first time, in the order of time, drawn already or not; some of them are put together."""
         self._seen.append(frame.index)
-        wanted, may_keep = frame.index in self._wanted, frame.index in self._may_keep
+        if not pose_weight(frame.confidence):  # such a pose redraws nothing
+            self.kept.add(frame.index)
+        wanted = frame.index in self._wanted
+        may_keep = frame.index in self._may_keep and frame.index not in self.kept
         if not (wanted or may_keep) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = frame if isinstance(frame, Drawn) else self._scene(frame)
@@ -205,8 +208,6 @@ class VideoSegmenter:
 
     def _decided(self, frame: ObjectView, order: TemporalNeighbours) -> tuple[int, SegmentedMask | None]:
         if self._due is not None and frame.index not in self._due:
-            return frame.index, None
-        if not pose_weight(frame.confidence):
             return frame.index, None
         initial_weight = self._initial_weight(frame)
         if initial_weight == 1:

@@ -264,7 +264,7 @@ def through_lens(state: Mapped, camera: Camera) -> Mapped:
     return replace(state, camera=camera, object_map=map_through_lens(state.object_map, before, camera))
 
 
-def in_space(
+def reproject_features(
     object_map: ObjectMap, own: FeatureSpace | None, space: FeatureSpace | None, encoder: FeatureEncoder
 ) -> ObjectMap:
     """A map whose features are of its ``own`` space, with those of another map's: turned, or encoded once more.
@@ -308,7 +308,7 @@ def merge_states(states: Sequence[Mapped], similarities: Sequence[Similarity], c
     first, camera = states[0], states[0].camera
     object_map = first.object_map
     for state, similarity in zip(states[1:], similarities[1:], strict=True):
-        second = in_space(
+        second = reproject_features(
             transform_map(state.object_map, similarity), state.feature_space, first.feature_space, encoder
         )
         pairs = match_landmarks(object_map, second, camera)

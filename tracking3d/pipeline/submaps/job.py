@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.pipeline.submaps.cuts import parse_length
 from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video.source import FrameSource, parse_selection
-
-Tell = Callable[[Any], None]
 
 
 @dataclass(frozen=True, eq=False)

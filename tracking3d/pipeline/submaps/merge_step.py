@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from tracking3d.config.models import OnlineConfig, PipelineConfig
+from tracking3d.engines.protocol import Reporter
 from tracking3d.estimation.online.atlas import transform_map
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
 from tracking3d.estimation.online.state.object_map import ObjectMap
@@ -41,14 +42,20 @@ from tracking3d.pipeline.submaps.alignment import (
     fit_similarity,
     merge_states,
 )
-from tracking3d.pipeline.submaps.job import Tell
 from tracking3d.pipeline.submaps.merged_run import (
     PartRun,
     move_refined_estimates,
     write_causal_mesh,
     write_merged_run,
 )
-from tracking3d.pipeline.submaps.plan import PARTS, Begun, Plan, part_folder, put_cut_mask, remove_parts
+from tracking3d.pipeline.submaps.plan import (
+    PARTS,
+    Plan,
+    PlannedVideo,
+    part_folder,
+    put_cut_mask,
+    remove_parts,
+)
 from tracking3d.pipeline.submaps.submap_runs import (
     PartJob,
     Revisit,
@@ -85,14 +92,14 @@ part before ends with. One of them may well have lost a side of the object."""
 class Tracked:
     """A video whose parts have their causal estimates."""
 
-    begun: Begun  # the video
+    planned: PlannedVideo  # the video
     jobs: tuple[PartJob, ...]  # its parts, as they were tracked last
     again: tuple[int, ...] = ()  # numbers of the parts that were tracked again
     seconds: float = 0.0  # what tracking the parts took
 
 
 @dataclass(frozen=True, eq=False)
-class Again:
+class Retrack:
     """A part that began on something else and is to be tracked once more."""
 
     number: int
@@ -100,7 +107,7 @@ class Again:
 
 
 @dataclass(frozen=True)
-class Refused:
+class MergeFailure:
     """Why parts cannot be merged."""
 
     reason: str
@@ -110,78 +117,78 @@ class Refused:
 class MergedSubmaps:
     """A video whose parts are one run, but for its second estimates."""
 
-    begun: Begun  # the video
-    looks: tuple[Revisit, ...]  # frames to be refined, by parts
+    planned: PlannedVideo  # the video
+    revisits: tuple[Revisit, ...]  # frames to be refined, by parts
     about: Mapping[str, Any]  # the section split of run.json
     seconds: Mapping[str, float] = field(default_factory=dict)  # what each step took, by name
 
 
-def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
+def merge_parts(tell: Reporter, tracked: Tracked) -> Retrack | MergeFailure | MergedSubmaps:
     """Merge the parts into one run, up to the refinement of all frames.
 
     Raises:
         Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
-    begun, clock = tracked.begun, time.monotonic()
-    video = begun.video
+    planned, clock = tracked.planned, time.monotonic()
+    video = planned.video
     if (again := _find_running(tracked)) is not None:
         return again
-    with open_tracking(_request(begun)) as opened:
+    with open_tracking(_request(planned)) as opened:
         session = opened.objects[0].session
     try:
-        whole = merge_submaps(session, begun.config, begun.plan, video.folder)
+        whole = merge_submaps(session, planned.config, planned.plan, video.folder)
     except DisagreementError as error:
         _log.warning("The parts could not be merged: %s.", error)
-        return Refused(str(error))
-    seconds = {"preview": begun.plan.seconds, "parts": tracked.seconds}
+        return MergeFailure(str(error))
+    seconds = {"preview": planned.plan.seconds, "parts": tracked.seconds}
     seconds["merge"], clock = time.monotonic() - clock, time.monotonic()
     about = {
         "workers": video.workers,
         "parts": [[run.part.start, run.part.stop] for run in whole.runs],
-        "preview_frames": begun.plan.preview_frames,
+        "preview_frames": planned.plan.preview_frames,
         "retracked": list(tracked.again),
         "alignments": whole.alignments,
         "cost_ratio": whole.cost_ratio,
     }
-    writer = _begin_writing(begun, opened, whole)
-    owned = _owned_ranges(begun)
+    writer = _begin_writing(planned, opened, whole)
+    owned = _owned_ranges(planned)
     session.load_state_dict(opened.first, whole.session, {})
     write_causal_mesh(video.folder, session)
     session.refine()
     write_merged_run(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
     seconds["refine"] = time.monotonic() - clock
     note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
-    return MergedSubmaps(begun, _revisits(begun, owned), about, seconds)
+    return MergedSubmaps(planned, _revisits(planned, owned), about, seconds)
 
 
 @dataclass(frozen=True, eq=False)
-class Ending:
+class FinishJob:
     """A video whose frames are all estimated, to be drawn."""
 
     merged: MergedSubmaps  # the run; its seconds are those of all steps
     precomputed: PrecomputedRefinement  # what the last steps of its final refinement come to
 
 
-def end(tell: Tell, ending: Ending) -> None:
+def finish_run(tell: Reporter, job: FinishJob) -> None:
     """Draw the estimates, and write the final files; the parts are removed.
 
     Args:
         tell: Called with the estimates that are drawn.
-        ending: All that is known.
+        job: All that is known.
 
     Raises:
         Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
-    begun = ending.merged.begun
-    video, config = begun.video, begun.config
-    about = {**ending.merged.about, "seconds": dict(ending.merged.seconds)}
+    planned = job.merged.planned
+    video, config = planned.video, planned.config
+    about = {**job.merged.about, "seconds": dict(job.merged.seconds)}
     note_in_run(video.folder, {"split": about})
     options = RecordOptions(video.command, video.selection, resume=True)
-    with open_tracking(_request(begun)) as opened, ExitStack() as writers:
-        opened = replace(opened, tracker_choice=begun.choice)
+    with open_tracking(_request(planned)) as opened, ExitStack() as writers:
+        opened = replace(opened, tracker_choice=planned.choice)
         recording = begin_recording(opened, 0, video.folder, options, writers)
         if recording is not None:
-            recording.precomputed = ending.precomputed
+            recording.precomputed = job.precomputed
             with running(opened.source, [recording], tell) as active:  # every frame has its causal estimate
                 run_refinement(opened.source, active)
     if recording is not None:
@@ -190,19 +197,19 @@ def end(tell: Tell, ending: Ending) -> None:
     remove_parts(video.folder)
 
 
-def _request(begun: Begun) -> TrackRequest:
+def _request(planned: PlannedVideo) -> TrackRequest:
     """The whole video, with the mask tracker that was chosen."""
-    video = begun.video
+    video = planned.video
     source = open_source(video.source, video.selection)
-    return request_tracking(source, begun.config, video.prompts, skip_damaged=True)
+    return request_tracking(source, planned.config, video.prompts, skip_damaged=True)
 
 
-def _find_running(tracked: Tracked) -> Again | None:
+def _find_running(tracked: Tracked) -> Retrack | None:
     """The first part that began on something else than the part before ends with, and was not tracked again yet."""
-    begun = tracked.begun
-    folder, whole = begun.video.folder, begun.video.frames(begun.count)
+    planned = tracked.planned
+    folder, whole = planned.video.folder, planned.video.frames(planned.count)
     checked = max(tracked.again, default=0)
-    for before, part in zip(begun.plan.parts, begun.plan.parts[1:], strict=False):
+    for before, part in zip(planned.plan.parts, planned.plan.parts[1:], strict=False):
         if part.number <= checked:
             continue
         cut = whole[part.start]
@@ -223,48 +230,48 @@ def _find_running(tracked: Tracked) -> Again | None:
             _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
             put_cut_mask(folder, part, estimate)
             job = replace(tracked.jobs[part.number], prompts=PromptSet.of_one(mask=estimate), resume=False)
-            return Again(part.number, job)
+            return Retrack(part.number, job)
     return None
 
 
-def _owned_ranges(begun: Begun) -> list[range]:
+def _owned_ranges(planned: PlannedVideo) -> list[range]:
     """Indices of the frames whose estimates are taken from each part."""
-    whole = begun.video.frames(begun.count)
-    starts = [part.owns_from for part in begun.plan.parts]
+    whole = planned.video.frames(planned.count)
+    starts = [part.owns_from for part in planned.plan.parts]
     return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
 
 
-def _begin_writing(begun: Begun, opened: OpenTracking, whole: MergedMap) -> RunWriter:
+def _begin_writing(planned: PlannedVideo, opened: OpenTracking, whole: MergedMap) -> RunWriter:
     """The writer of the merged run, with the header of a run before its first frame."""
-    video, source, [one] = begun.video, opened.source, opened.objects
+    video, source, [one] = planned.video, opened.source, opened.objects
     header = RunHeader(
-        config=begun.config.model_dump(mode="json"),
+        config=planned.config.model_dump(mode="json"),
         camera=whole.camera,
         source=source.name,
-        seed=begun.config.runtime.seed,
+        seed=planned.config.runtime.seed,
         renderer=one.session.renderer,
         fps=source.fps,
         command=video.command,
         selection=video.selection,
-        given=prompt_record(opened.first, one.prompt, source.count),
-        tracker_choice=begun.choice,
+        prompt=prompt_record(opened.first, one.prompt, source.count),
+        tracker_choice=planned.choice,
     )
     return RunWriter(video.folder, header, overwrite=True)
 
 
-def _revisits(begun: Begun, owned: Sequence[range]) -> tuple[Revisit, ...]:
-    video = begun.video
+def _revisits(planned: PlannedVideo, owned: Sequence[range]) -> tuple[Revisit, ...]:
+    video = planned.video
     return tuple(
         Revisit(
             video.source,
             video.selection,
             f"{mine.start}:{mine[-1] + 1}:{mine.step}",
-            begun.config,
+            planned.config,
             video.folder,
             video.prompts,
             video.folder / PARTS / f"second_{part.number}",
         )
-        for part, mine in zip(begun.plan.parts, owned, strict=True)
+        for part, mine in zip(planned.plan.parts, owned, strict=True)
     )
 
 
@@ -486,15 +493,15 @@ def _describe(alignment: SubmapAlignment) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Settling:
+class AdjustJob:
     """Refined estimates of all parts, to be merged."""
 
-    looks: Sequence[Revisit]  # the frames that were looked at, by parts, in order of time
+    revisits: Sequence[Revisit]  # the frames that were looked at, by parts, in order of time
     seconds: float  # what the refinement took until then
 
 
 @dataclass(frozen=True, eq=False)
-class Placing:
+class PoseJob:
     """Frames of one part, to get their final poses."""
 
     job: Revisit  # the frames
@@ -502,7 +509,7 @@ class Placing:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighing:
+class MaskJob:
     """Frames, to get their final masks."""
 
     job: Revisit  # the frames; those of the whole video when masks are collected
@@ -514,16 +521,16 @@ class Weighing:
     masks: VideoSegmenter | None = None
 
 
-def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
+def solve_together(tell: Reporter, job: AdjustJob) -> GlobalAdjustment:
     """Write the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
 
     Raises:
         Tracking3dError: If something cannot be read or written.
     """
-    first = job.looks[0]
+    first = job.revisits[0]
     kept, session = resume_submap(first)
     if kept.progress.last_refined < kept.progress.last:  # not in their places yet
-        move_refined_estimates(first.folder, session, [look.out for look in job.looks], job.seconds)
+        move_refined_estimates(first.folder, session, [one.out for one in job.revisits], job.seconds)
     estimates = _estimates(first.folder, session.camera)
     most = session.config.object.adjustment_views
     look = GlobalAdjustment(session.result(), session.camera, sorted(estimates.causal), most)
@@ -535,7 +542,7 @@ def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
     return look
 
 
-def adjust_poses(tell: Tell, job: Placing) -> tuple[list[FrameRecord], dict[int, bytes]]:
+def adjust_poses(tell: Reporter, job: PoseJob) -> tuple[list[FrameRecord], dict[int, bytes]]:
     """The estimates of some frames with their adjusted poses, and the masks of those that were estimated again.
 
     Raises:
@@ -553,7 +560,7 @@ def adjust_poses(tell: Tell, job: Placing) -> tuple[list[FrameRecord], dict[int,
     return found, last.retracked
 
 
-def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
+def collect_masks(tell: Reporter, job: MaskJob) -> VideoSegmenter:
     """What the masks of all frames have in common.
 
     Raises:
@@ -571,7 +578,7 @@ def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
     return last.masks
 
 
-def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
+def decide_masks(tell: Reporter, job: MaskJob) -> dict[int, bytes]:
     """The final masks of some frames, as PNG files, by index; those that stand are left out.
 
     Raises:
@@ -589,7 +596,7 @@ def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
     return found
 
 
-def _decisions(job: Weighing, estimates: RefinedEstimates, own: range) -> Iterator[Decision]:
+def _decisions(job: MaskJob, estimates: RefinedEstimates, own: range) -> Iterator[Decision]:
     """Estimates of a part's frames, and of the frames before and after, for their motion."""
     last = RefinementSteps(estimates, job.look, job.masks)
     reach = 2 * REACH * own.step

@@ -118,7 +118,7 @@ def move_refined_estimates(folder: Path, session: Session, made: Sequence[Path],
         refinement_seconds=seconds,
     )
     checkpoint.save(done, before.session)
-    checkpoint.clear_strangers()
+    checkpoint.remove_orphans()
 
 
 def _transform_records(records: Sequence[FrameRecord], similarity: Similarity) -> list[FrameRecord]:

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.engines.protocol import Reporter
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.pipeline.open_tracking import open_tracking, request_tracking
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.record import RecordOptions, record_tracking
 from tracking3d.pipeline.submaps.cuts import Part, Sighting, cuts_in, overlap_of, parts_at, windows
-from tracking3d.pipeline.submaps.job import LongVideo, SplitResult, Tell, frames_of_part
+from tracking3d.pipeline.submaps.job import LongVideo, SplitResult, frames_of_part
 from tracking3d.pipeline.submaps.submap_runs import PartJob
 from tracking3d.results import layout
 from tracking3d.results.checkpoint.resuming import prompt_record
@@ -288,7 +289,7 @@ BEFORE = "that was found when they were tracked"
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
+class PlannedVideo:
     """A video that is cut."""
 
     video: LongVideo  # what is tracked
@@ -299,7 +300,7 @@ class Begun:
     jobs: tuple[PartJob, ...]  # its parts
 
 
-def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
+def plan_video(tell: Reporter, video: LongVideo) -> PlannedVideo | SplitResult:
     """Cut a video, unless it is one part, or done; ``tell`` is given the estimates if it is tracked here.
 
     Raises:
@@ -338,7 +339,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
         return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)
-    return Begun(video, config, choice, count, plan, jobs)
+    return PlannedVideo(video, config, choice, count, plan, jobs)
 
 
 def is_there(folder: Path) -> bool:

@@ -12,29 +12,14 @@ from typing import Any, TypeVar
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine
-from tracking3d.engines.protocol import Ended, Event, Task, Told
+from tracking3d.engines.protocol import Ended, Event, ProgressReport, Reporter, Task
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.passes import Listener
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
+from tracking3d.pipeline.submaps import merge_step
 from tracking3d.pipeline.submaps.job import LongVideo, SplitResult
-from tracking3d.pipeline.submaps.merge_step import (
-    Again,
-    Ending,
-    MergedSubmaps,
-    Placing,
-    Refused,
-    Settling,
-    Tracked,
-    Weighing,
-    adjust_poses,
-    end,
-    join,
-    put_together,
-    solve_together,
-    weigh,
-)
-from tracking3d.pipeline.submaps.plan import Begun, begin
+from tracking3d.pipeline.submaps.plan import PlannedVideo, plan_video
 from tracking3d.pipeline.submaps.submap_runs import PartJob, Revisit, refine_submap, track_part
 from tracking3d.results.records import FrameRecord
 from tracking3d.trackers.prompts.prompt import PromptSet
@@ -85,10 +70,10 @@ def record_in_parts(
         str(source), config, folder, prompts, length, workers, selection, command, overwrite, resume
     )
     told, map_jobs = _once(listener), map_jobs or partial(run_in_processes, workers=workers)
-    begun = begin(told, video)
-    if isinstance(begun, SplitResult):
-        return begun
-    steps = steps_of(begun)
+    planned = plan_video(told, video)
+    if isinstance(planned, SplitResult):
+        return planned
+    steps = steps_of(planned)
     estimates: list[Any] | None = None
     while True:
         try:
@@ -119,12 +104,10 @@ def _once(listener: Listener) -> Listener:
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-Tell = Callable[[Any], None]
-"""Takes whatever can be pickled to who waits for the job."""
 
 
 def run_in_processes(
-    function: Callable[[Tell, Job], Result],
+    function: Callable[[Reporter, Job], Result],
     jobs: Sequence[Job],
     workers: int,
     told: Callable[[Any], None] = lambda content: None,
@@ -146,7 +129,7 @@ def run_in_processes(
         return [function(told, job) for job in jobs]
 
     def listener(event: Event) -> None:
-        if isinstance(event, Told):
+        if isinstance(event, ProgressReport):
             told(event.content)
         elif isinstance(event, Ended):
             _raise(event)
@@ -163,7 +146,7 @@ class _Raised:
     error: Tracking3dError
 
 
-def _call(tell: Tell, function: Callable[[Tell, Any], Any], job: Any) -> Any:
+def _call(tell: Reporter, function: Callable[[Reporter, Any], Any], job: Any) -> Any:
     try:
         return function(tell, job)
     except Tracking3dError as error:
@@ -198,67 +181,68 @@ Steps = Generator[list[Step], list[Any], SplitResult]
 """Gives steps that may be done side by side, and is sent what they returned, in their order."""
 
 
-def steps_of(begun: Begun) -> Steps:
+def steps_of(planned: PlannedVideo) -> Steps:
     """What is to be done for a video that is cut, until it is one run, or a run a part."""
-    jobs, again = list(begun.jobs), list[int]()
+    jobs, again = list(planned.jobs), list[int]()
     of, clock = len(jobs), time.monotonic()
     yield [
         Step(track_part, job, f"part {number} of {of}", _frames(job)) for number, job in enumerate(jobs, 1)
     ]
     while True:
-        taken = time.monotonic() - clock
-        [found] = yield [Step(join, Tracked(begun, tuple(jobs), tuple(again), taken), "merging its parts")]
-        if not isinstance(found, Again):
+        tracked = merge_step.Tracked(planned, tuple(jobs), tuple(again), time.monotonic() - clock)
+        [found] = yield [Step(merge_step.merge_parts, tracked, "merging its parts")]
+        if not isinstance(found, merge_step.Retrack):
             break
         jobs[found.number] = found.job
         again.append(found.number)
         yield [Step(track_part, found.job, f"part {found.number + 1} of {of} again", _frames(found.job))]
-    if isinstance(found, Refused):
+    if isinstance(found, merge_step.MergeFailure):
         whole = [replace(job, resume=True, first_pass_only=False) for job in jobs]
         yield [Step(track_part, job, f"end of part {number} of {of}") for number, job in enumerate(whole, 1)]
         return SplitResult(tuple(job.folder for job in jobs), of, found.reason)
-    assert isinstance(found, MergedSubmaps)
+    assert isinstance(found, merge_step.MergedSubmaps)
     clock = time.monotonic()
-    looks = found.looks
     yield [
-        Step(refine_submap, look, f"refinement pass {number} of {of}", _frames(look))
-        for number, look in enumerate(looks, 1)
+        Step(refine_submap, revisit, f"refinement pass {number} of {of}", _frames(revisit))
+        for number, revisit in enumerate(found.revisits, 1)
     ]
     seconds = {**found.seconds, "refinement_pass": time.monotonic() - clock}
     yield from steps_to_the_end(replace(found, seconds=seconds))
-    return SplitResult((begun.video.folder,), of)
+    return SplitResult((planned.video.folder,), of)
 
 
-def steps_to_the_end(merged: MergedSubmaps) -> Generator[list[Step], list[Any], None]:
+def steps_to_the_end(merged: merge_step.MergedSubmaps) -> Generator[list[Step], list[Any], None]:
     """The steps after all frames of a merged run have been refined."""
     precomputed, seconds = yield from _refine_in_parallel(merged)
     merged = replace(merged, seconds={**merged.seconds, **seconds})
-    yield [Step(end, Ending(merged, precomputed), "writing its results")]
+    yield [Step(merge_step.finish_run, merge_step.FinishJob(merged, precomputed), "writing its results")]
 
 
 def _refine_in_parallel(
-    merged: MergedSubmaps,
+    merged: merge_step.MergedSubmaps,
 ) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
     """The final refinement of the parts: its last steps, and the seconds of each."""
-    looks, of, clock = merged.looks, len(merged.looks), time.monotonic()
+    revisits, of, clock = merged.revisits, len(merged.revisits), time.monotonic()
     refined = merged.seconds["refine"] + merged.seconds["refinement_pass"]
-    [look] = yield [Step(solve_together, Settling(looks, refined), "global adjustment")]
+    [look] = yield [
+        Step(merge_step.solve_together, merge_step.AdjustJob(revisits, refined), "global adjustment")
+    ]
     settled = time.monotonic()
     placed = yield [
-        Step(adjust_poses, Placing(job, look), f"poses {number} of {of}")
-        for number, job in enumerate(looks, 1)
+        Step(merge_step.adjust_poses, merge_step.PoseJob(job, look), f"poses {number} of {of}")
+        for number, job in enumerate(revisits, 1)
     ]
     estimates = {record.index: record for part, _ in placed for record in part}
     retracked = {index: mask for _, part in placed for index, mask in part.items()}
     seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
-    if not merged.begun.config.object.segments_again:
+    if not merged.planned.config.object.segments_again:
         return PrecomputedRefinement(look, estimates, {}, retracked), seconds
     clock = time.monotonic()
-    weighing = Weighing(looks[0], estimates, look, retracked)
-    [masks] = yield [Step(put_together, weighing, "collecting its masks")]
+    masking = merge_step.MaskJob(revisits[0], estimates, look, retracked)
+    [masks] = yield [Step(merge_step.collect_masks, masking, "collecting its masks")]
     decided = yield [
-        Step(weigh, replace(weighing, job=job, masks=masks), f"masks {number} of {of}")
-        for number, job in enumerate(looks, 1)
+        Step(merge_step.decide_masks, replace(masking, job=job, masks=masks), f"masks {number} of {of}")
+        for number, job in enumerate(revisits, 1)
     ]
     pictures = {index: mask for part in decided for index, mask in part.items()}
     masks_took = time.monotonic() - clock

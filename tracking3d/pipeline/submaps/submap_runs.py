@@ -5,12 +5,11 @@ What is here runs in processes of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tracking3d.config.models import PipelineConfig
+from tracking3d.engines.protocol import Reporter
 from tracking3d.frames import Frame
 from tracking3d.pipeline.frame_reading import SavedMasks, read_timed
 from tracking3d.pipeline.open_tracking import open_tracking, request_tracking
@@ -28,8 +27,6 @@ from tracking3d.trackers.prompts.prompt import PromptSet
 from tracking3d.video import open_source, parse_selection
 from tracking3d.video.source import FrameSource
 
-Tell = Callable[[Any], None]
-
 
 @dataclass(frozen=True, eq=False)
 class PartJob:
@@ -45,7 +42,7 @@ class PartJob:
     first_pass_only: bool = True  # stop when every frame has its causal estimate
 
 
-def track_part(tell: Tell, job: PartJob) -> None:
+def track_part(tell: Reporter, job: PartJob) -> None:
     """Track one part; ``tell`` is given each frame's record.
 
     Raises:
@@ -84,7 +81,7 @@ class Revisit:
     out: Path  # folder that gets masks/ and frames.jsonl of the refined estimates
 
 
-def refine_submap(tell: Tell, job: Revisit) -> int:
+def refine_submap(tell: Reporter, job: Revisit) -> int:
     """Refine some frames, in order of time; ``tell`` is given each estimate's record.
 
     Returns:

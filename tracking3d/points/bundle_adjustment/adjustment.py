@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.geometry.levenberg_marquardt import Damping, damped, minimizer
 from tracking3d.points.bundle_adjustment.reprojection import (
     FloatArray,
     apply_pose_steps,
@@ -23,9 +24,7 @@ from tracking3d.points.bundle_adjustment.reprojection import (
     transform_to_camera,
 )
 
-_FIRST_DAMPING = 1e-3
-_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
-_TRIES = 6
+_DAMPING = Damping(least=1e-9, most=1e9, decrease=10, increase=10, tries=6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +86,14 @@ class System:
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None if there is none."""
-        poses, points = _damp(self.poses, damping), _damp(self.points, damping)
+        poses, points = damped(self.poses, damping), damped(self.points, damping)
         from tracking3d.points.bundle_adjustment.kernels import normal_equations
 
         return normal_equations.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
 
     def last_curvature(self) -> float:
         """Curvature along the last unknown of the poses, with all others eliminated; 0 if it is not known."""
-        poses, points = _damp(self.poses, _LEAST_DAMPING), _damp(self.points, _LEAST_DAMPING)
+        poses, points = damped(self.poses, _DAMPING.least), damped(self.points, _DAMPING.least)
         try:
             coupling = np.linalg.solve(np.linalg.cholesky(points), self.coupling).reshape(-1, len(poses))
             reduced = poses - coupling.T @ coupling
@@ -143,6 +142,11 @@ class AdjustmentProblem:
         points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
         points_gradient = system.points_gradient + 2 * self.prior_weight[:, None] * (at.points - self.prior)
         return replace(system, points=points, points_gradient=points_gradient)
+
+    def stepped(self, at: Structure, system: System, damping: float) -> Structure:
+        """After a damped step, with its cost; this is infinite if there is no step."""
+        step = system.step(damping)
+        return replace(at, cost=math.inf) if step is None else self.evaluate(self.step_by(at, *step))
 
     def step_by(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
         """After a step."""
@@ -212,21 +216,9 @@ def adjust(
         prior_weight=np.where(held, point_prior_weight, 0.0),
     )
     begun = replace(start, points=np.where(known[:, None], start.points, 0.0))
-    best = problem.evaluate(begun)
-    damping, tried, settled = _FIRST_DAMPING, 0, False
-    while tried < iterations and not settled:
-        system = problem.linearize(best)
-        for _ in range(_TRIES):
-            tried += 1
-            step = system.step(damping)
-            better = None if step is None else problem.evaluate(problem.step_by(best, *step))
-            if better is not None and better.cost < best.cost:
-                settled = best.cost - better.cost < converged * best.cost
-                best, damping = better, max(damping / 10, _LEAST_DAMPING)
-                break
-            damping = min(damping * 10, _MOST_DAMPING)
-        else:
-            settled = True
+    minimize = minimizer(AdjustmentProblem.linearize, AdjustmentProblem.stepped)
+    options = _DAMPING._replace(converged=converged)
+    best, tried = minimize(problem, problem.evaluate(begun), options, iterations)
     if fixed == 1 and not problem.prior_weight.any():
         best = problem.evaluate(_with_depth_of(begun, best, problem.weight.max(0, initial=0.0) > 0))
     points = np.where(known[:, None], best.points, np.nan)
@@ -249,13 +241,6 @@ def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.
     points = (factor * structure.points @ R0.T + (factor - 1) * t0) @ R0
     t = factor * structure.t + (1 - factor) * (structure.R @ (R0.T @ t0))
     return replace(structure, t=t, points=points)
-
-
-def _damp(matrix: FloatArray, damping: float) -> FloatArray:
-    """Levenberg-Marquardt's: a share of each diagonal entry more, and a floor that keeps unseen parts still."""
-    diagonal = np.einsum("...ii->...i", matrix)
-    floor = 1e-9 * diagonal.max(initial=0.0) + 1e-12
-    return matrix + (damping * diagonal + floor)[..., None] * np.eye(matrix.shape[-1])
 
 
 # Depth reversal: the other explanation of the same tracks.

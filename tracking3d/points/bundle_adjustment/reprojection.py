@@ -7,6 +7,8 @@ object's origin as pivot.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,6 +20,17 @@ NEAREST = 1e-6
 
 BEHIND = 100.0
 """A point that is seen, yet has no image, costs as much as a residual of this many robust scales."""
+
+
+class EvaluatedPose(NamedTuple):
+    """A pose with the model ``cost + gradient d + d matrix d / 2`` of what it costs. A named tuple, for kernels."""
+
+    cost: float
+    R: FloatArray  # (3, 3) of T_cam_obj
+    t: FloatArray  # (3,)
+    details: FloatArray  # (M,) of points their distances in pixels, NaN for those without; of a frame see `PoseFit`
+    matrix: FloatArray  # (6, 6), see `tracking3d.rendering.NormalEquations`
+    gradient: FloatArray  # (6,)
 
 
 def finite_rows(rows: FloatArray) -> NDArray[np.bool_]:

@@ -170,8 +170,10 @@ def _alone(folder: Path, function: Callable[..., Any]) -> Iterator[None]:
 
 
 def _drop_stale(folder: Path, function: Callable[..., Any]) -> None:
-    """Forget a compiled kernel that is older than any kernel's source: Numba looks at its own file only."""
-    rooms = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
+    """Forget a compiled kernel that is older than what it may be made of: Numba looks at its own file only."""
+    package = Path(__file__).parents[2]
+    shared = package / "geometry", package / "points/bundle_adjustment/kernels"
+    rooms = {Path(__file__).parent, Path(function.__code__.co_filename).parent, *shared}
     newest = max(source.stat().st_mtime for room in rooms for source in room.glob("*.py"))
     if any(index.stat().st_mtime < newest for index in folder.glob(f"*.{function.__name__}-*.nbi")):
         _forget(folder, function.__name__)

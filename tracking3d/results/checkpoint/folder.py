@@ -44,20 +44,20 @@ class Checkpoint:
         folder: The run folder.
         classes: See `TreeFolder`.
         device: See `TreeFolder`.
-        milestones: Number of rollback points that may be saved, see `tracking3d.results.checkpoint.folder`.
+        rollback_points: Number of rollback points that may be saved, see `tracking3d.results.checkpoint.folder`.
 
     Raises:
         OutputError: If the folder cannot be written.
     """
 
     def __init__(
-        self, folder: Path, classes: tuple[type, ...], device: str = "cpu", milestones: int = 0
+        self, folder: Path, classes: tuple[type, ...], device: str = "cpu", rollback_points: int = 0
     ) -> None:
         self._folder = folder / layout.STATE
         with writing(self._folder):
             self._folder.mkdir(exist_ok=True)
         self._trees = TreeFolder(self._folder, classes, device)
-        self._milestones = Milestones(self._folder, milestones)
+        self._rollback_points = RollbackPoints(self._folder, rollback_points)
         self._taken: dict[int, int] = {}  # number of frames taken up to each of them
         self._journal = 0
         self._waiting = b""
@@ -73,7 +73,7 @@ class Checkpoint:
     @property
     def rollback_point_due(self) -> bool:
         """Whether the state after the frame that was noted last is to be a rollback point."""
-        return self._is_new and self._milestones.due(len(self._taken))
+        return self._is_new and self._rollback_points.due(len(self._taken))
 
     def save(
         self,
@@ -105,16 +105,18 @@ class Checkpoint:
             text = f'{json.dumps(head)[:-1]}, "session": {tree}}}\n'
             write_atomic(self._folder / layout.STATE_FILE, text.encode("ascii"))
             self._journal, self._waiting = length, b""
-            self._milestones.forget_after(
+            self._rollback_points.forget_after(
                 min((self._taken.get(one, 0) - 1 for one in revised), default=len(self._taken))
             )
             if self.rollback_point_due:
-                self._milestones.keep(self._folder / layout.STATE_FILE, len(self._taken), self._trees.arrays)
+                self._rollback_points.keep(
+                    self._folder / layout.STATE_FILE, len(self._taken), self._trees.arrays
+                )
             self._is_new = False
             if progress.refining and progress.last_refined < 0:
                 state = self._folder / layout.STATE_FILE
-                self._milestones.keep_refinement_start(state, len(self._taken), self._trees.arrays)
-            self._trees.tidy(self._milestones.arrays)
+                self._rollback_points.keep_refinement_start(state, len(self._taken), self._trees.arrays)
+            self._trees.tidy(self._rollback_points.arrays)
 
     def read(self, name: str = layout.STATE_FILE) -> SavedState:
         """Read the last saved state, or an earlier one.
@@ -151,11 +153,11 @@ class Checkpoint:
     def earlier_states(self) -> list[str]:
         """File names of the states before the last one, for `read`; the latest first."""
         start = self._folder / layout.REFINEMENT_START
-        earlier = [one.path.name for one in reversed(milestones_in(self._folder))]
+        earlier = [one.path.name for one in reversed(rollback_points_in(self._folder))]
         return [*([start.name] if start.is_file() else []), *earlier]
 
     def return_to(self, name: str) -> None:
-        """Let an earlier state take the place of the last one; what is newer is removed by `clear_strangers`.
+        """Let an earlier state take the place of the last one; what is newer is removed by `remove_orphans`.
 
         Raises:
             OutputError: If it cannot be written.
@@ -163,15 +165,15 @@ class Checkpoint:
         with writing(self._folder):
             write_atomic(self._folder / layout.STATE_FILE, (self._folder / name).read_bytes())
 
-    def clear_strangers(self) -> None:
+    def remove_orphans(self) -> None:
         """Remove the files of a state that was not finished, after `read`.
 
         Raises:
             OutputError: If they cannot be removed.
         """
         with writing(self._folder):
-            self._milestones.read(len(self._taken))
-            self._trees.clear_strangers(self._milestones.arrays)
+            self._rollback_points.read(len(self._taken))
+            self._trees.remove_orphans(self._rollback_points.arrays)
 
     def keep_correction(self, index: int, mask: NDArray[np.bool_]) -> None:
         """Save the mask ``(H, W)`` that was fed back to the mask tracker in frame ``index``.
@@ -195,21 +197,18 @@ class Checkpoint:
             raise InputError(f"{path} is missing or damaged; run it again with {layout.OVERWRITE}.")
         return mask
 
-    def finish(self) -> None:
-        """Keep only the rollback points of the finished run, see `finish_state`.
-
-        Raises:
-            OutputError: If something cannot be removed.
-        """
-        finish_state(self._folder.parent)
-
     def remove(self) -> None:
         """Remove the checkpoint.
 
         Raises:
             OutputError: If it cannot be removed.
         """
-        remove_state(self._folder.parent)
+        with writing(self._folder):
+            # The state first: without it the rest is not read.
+            files = layout.state_files(self._folder.parent)
+            for path in sorted(files, key=lambda path: path.name != layout.STATE_FILE):
+                path.unlink(missing_ok=True)
+            _remove_empty(self._folder)
 
 
 def finish_state(folder: Path, most: int | None = None) -> None:
@@ -217,28 +216,29 @@ def finish_state(folder: Path, most: int | None = None) -> None:
 
     Args:
         folder: The run folder.
-        most: Bytes that it may take; `MOST_KEPT` if None.
+        most: Bytes that it may take; `MOST_KEPT` if None. Every second rollback point goes until the rest is no larger;
+            the last one stays longest.
 
     Raises:
         OutputError: If something cannot be removed.
     """
-    with writing(folder / layout.STATE):
-        keep_milestones_only(folder, MOST_KEPT if most is None else most)
-        _remove_empty(folder / layout.STATE)
-
-
-def remove_state(folder: Path) -> None:
-    """Remove the checkpoint in a run folder, if there is one.
-
-    Raises:
-        OutputError: If it cannot be removed.
-    """
-    inner = folder / layout.STATE
+    inner, most = folder / layout.STATE, MOST_KEPT if most is None else most
     with writing(inner):
-        # The state first: without it the rest is not read.
-        files = sorted(layout.state_files(folder), key=lambda path: path.name != layout.STATE_FILE)
-        for path in files:
-            path.unlink(missing_ok=True)
+        # The state first: without it nobody takes the run for one that was stopped.
+        (inner / layout.STATE_FILE).unlink(missing_ok=True)
+        kept = rollback_points_in(inner)
+        while kept and _bytes(inner, kept) > most:
+            thinner = kept[1::2] or ([] if len(kept) < 2 else kept[:1])
+            for one in kept:
+                if one not in thinner:
+                    one.path.unlink()
+            kept = thinner
+        needed = {name for one in kept for name in one.arrays} | {one.path.name for one in kept}
+        if kept:
+            needed |= {layout.JOURNAL}
+        for path in layout.state_files(folder):
+            if not kept or (path.parent == inner and path.name not in needed):
+                path.unlink(missing_ok=True)
         _remove_empty(inner)
 
 
@@ -260,7 +260,7 @@ _NAME = re.compile(r"milestone_(\d{6,})\.json")
 
 
 @dataclass(frozen=True)
-class Milestone:
+class RollbackPoint:
     """The state after a frame."""
 
     taken: int  # how many frames were taken until then
@@ -273,7 +273,7 @@ class Milestone:
         return self.path.stat().st_size
 
 
-class Milestones:
+class RollbackPoints:
     """Those of one run, at most so many, spread evenly over its frames.
 
     Args:
@@ -283,16 +283,16 @@ class Milestones:
 
     def __init__(self, folder: Path, most: int) -> None:
         self._folder, self._most = folder, most
-        self._kept: list[Milestone] = []
-        self._refinement: Milestone | None = None
+        self._kept: list[RollbackPoint] = []
+        self._refinement: RollbackPoint | None = None
         self._gap = _FIRST_GAP
 
     def read(self, taken: int) -> None:
         """Read those of a run that is resumed after so many frames; later ones are removed."""
-        self._kept = milestones_in(self._folder)
+        self._kept = rollback_points_in(self._folder)
         self.forget_after(taken)
         start = self._folder / layout.REFINEMENT_START
-        self._refinement = _read_milestone(start, taken) if start.is_file() else None
+        self._refinement = _read_rollback_point(start, taken) if start.is_file() else None
         self._gap = math.gcd(*(one.taken for one in self._kept)) or _FIRST_GAP
 
     @property
@@ -318,7 +318,7 @@ class Milestones:
         """
         path = self._folder / f"milestone_{taken:06d}.json"
         link_or_copy(state, path)
-        self._kept.append(Milestone(taken, path, arrays))
+        self._kept.append(RollbackPoint(taken, path, arrays))
         while len(self._kept) > self._most:
             self._gap *= 2
             self._drop([one for one in self._kept if one.taken % self._gap])
@@ -327,7 +327,7 @@ class Milestones:
         """Keep the state as the final refinement begins, beside the rollback points; see `keep`."""
         path = self._folder / layout.REFINEMENT_START
         link_or_copy(state, path)
-        self._refinement = Milestone(taken, path, arrays)
+        self._refinement = RollbackPoint(taken, path, arrays)
 
     def forget_after(self, taken: int) -> None:
         """Remove those after so many frames, since an earlier estimate has changed.
@@ -337,56 +337,27 @@ class Milestones:
         """
         self._drop([one for one in self._kept if one.taken > taken])
 
-    def _drop(self, gone: list[Milestone]) -> None:
+    def _drop(self, gone: list[RollbackPoint]) -> None:
         for one in gone:
             one.path.unlink(missing_ok=True)
         self._kept = [one for one in self._kept if one not in gone]
 
 
-def milestones_in(folder: Path) -> list[Milestone]:
+def rollback_points_in(folder: Path) -> list[RollbackPoint]:
     """The rollback points in the folder of a state, the earliest first."""
     found = []
     for path in sorted(folder.glob("milestone_*.json")) if folder.is_dir() else ():
         if name := _NAME.fullmatch(path.name):
-            found.append(_read_milestone(path, int(name[1])))
+            found.append(_read_rollback_point(path, int(name[1])))
     return sorted(found, key=lambda one: one.taken)
 
 
-def _read_milestone(path: Path, taken: int) -> Milestone:
+def _read_rollback_point(path: Path, taken: int) -> RollbackPoint:
     text = path.read_text(encoding="ascii", errors="replace")
-    return Milestone(taken, path, frozenset(_ARRAYS.findall(text)))
+    return RollbackPoint(taken, path, frozenset(_ARRAYS.findall(text)))
 
 
-def keep_milestones_only(folder: Path, most_bytes: int) -> None:
-    """Reduce the checkpoint in a run folder to its rollback points, and these to so many bytes.
-
-    Args:
-        folder: The run folder.
-        most_bytes: Their largest size. Every second rollback point goes until the rest is no larger; the last one
-            stays longest.
-
-    Raises:
-        OSError: If a file cannot be removed.
-    """
-    inner = folder / layout.STATE
-    # The state first: without it nobody takes the run for one that was stopped.
-    (inner / layout.STATE_FILE).unlink(missing_ok=True)
-    kept = milestones_in(inner)
-    while kept and _bytes(inner, kept) > most_bytes:
-        thinner = kept[1::2] or ([] if len(kept) < 2 else kept[:1])
-        for one in kept:
-            if one not in thinner:
-                one.path.unlink()
-        kept = thinner
-    needed = {name for one in kept for name in one.arrays} | {one.path.name for one in kept}
-    if kept:
-        needed |= {layout.JOURNAL}
-    for path in layout.state_files(folder):
-        if not kept or (path.parent == inner and path.name not in needed):
-            path.unlink(missing_ok=True)
-
-
-def _bytes(inner: Path, kept: list[Milestone]) -> int:
+def _bytes(inner: Path, kept: list[RollbackPoint]) -> int:
     names = {name for one in kept for name in one.arrays}
     sizes = [(inner / name).stat().st_size for name in names if (inner / name).is_file()]
     return sum(sizes) + sum(one.bytes for one in kept)

@@ -123,7 +123,7 @@ class TreeFolder:
         used.pop(id(self._root), None)
         self._known = {id(part.value): part for part in used.values()}
 
-    def clear_strangers(self, needed: Collection[str] = ()) -> None:
+    def remove_orphans(self, needed: Collection[str] = ()) -> None:
         """Remove array files that neither the latest tree names nor are ``needed``, such as those that a kill left."""
         named = self.arrays
         self._spared = set(needed) - named

@@ -16,7 +16,7 @@ from typing import Any
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
-from tracking3d.results.checkpoint.folder import Checkpoint, Milestone, milestones_in
+from tracking3d.results.checkpoint.folder import Checkpoint, RollbackPoint, rollback_points_in
 from tracking3d.results.checkpoint.integrity import RunIntegrity
 from tracking3d.results.checkpoint.progress import RunProgress, SavedState, read_journal
 from tracking3d.results.checkpoint.resuming import Earlier, changed_frames, earlier_run
@@ -171,10 +171,10 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
         InputError: If the run is damaged.
     """
     inner = folder / layout.STATE
-    milestones, integrity = milestones_in(inner), RunIntegrity(folder)
-    while milestones:
+    rollback_points, integrity = rollback_points_in(inner), RunIntegrity(folder)
+    while rollback_points:
         try:
-            state = json.loads(milestones[-1].path.read_bytes())
+            state = json.loads(rollback_points[-1].path.read_bytes())
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
             taken, skipped = read_journal(journal)
             progress = RunProgress(**state["progress"])
@@ -182,13 +182,15 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
         except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
             whole = False
         if whole and not {*taken, *(one.index for one in skipped)} & set(changed):
-            _copy_run(folder, stage, milestones, journal, progress.lines)
+            _copy_run(folder, stage, rollback_points, journal, progress.lines)
             return len(taken)
-        milestones.pop()
+        rollback_points.pop()
     return None
 
 
-def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: bytes, lines: int) -> None:
+def _copy_run(
+    folder: Path, stage: Path, rollback_points: list[RollbackPoint], journal: bytes, lines: int
+) -> None:
     run = RunReader(folder)
     records = latest(read_records(folder / layout.FRAMES, lines), refined=False)
     causal = folder / layout.CAUSAL
@@ -208,12 +210,12 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
                 if file and file[0].is_file():
                     place = file[0].relative_to(causal if file[0].is_relative_to(causal) else folder)
                     link_or_copy(file[0], stage / place)
-        for name in sorted({name for one in milestones for name in one.arrays}):
+        for name in sorted({name for one in rollback_points for name in one.arrays}):
             link_or_copy(folder / layout.STATE / name, stage / layout.STATE / name)
-        for one in milestones:
+        for one in rollback_points:
             link_or_copy(one.path, stage / layout.STATE / one.path.name)
         (stage / layout.STATE / layout.JOURNAL).write_bytes(journal)
-        link_or_copy(milestones[-1].path, stage / layout.STATE / layout.STATE_FILE)
+        link_or_copy(rollback_points[-1].path, stage / layout.STATE / layout.STATE_FILE)
     description = {**run.description, "state": "interrupted", "refinement": None}
     corrections = (run.description.get("prompt") or {}).get("corrections") or []
     estimated = {record.index for record in records}

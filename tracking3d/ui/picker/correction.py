@@ -20,7 +20,7 @@ from tracking3d.frames import Box
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
 from tracking3d.results.run_reader import is_finished
-from tracking3d.ui.picker.drawing import DrawnObject, parse_object
+from tracking3d.ui.picker.drawing import DrawnObject, parse
 from tracking3d.ui.picker.server import PageProgress, Picker, ShownRun
 from tracking3d.ui.picker.session import Picked, PickingSession
 from tracking3d.ui.web.access import Access
@@ -75,7 +75,7 @@ class CorrectionPage(Picker):
         """
         if path not in ("/mask", "/correct"):
             return None
-        drawn = parse_object(body)
+        drawn = parse(body, DrawnObject)
         present = self._present(drawn.frame)
         if path == "/mask":
             run_mask = present if drawn.is_empty else None

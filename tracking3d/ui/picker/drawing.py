@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -71,31 +71,24 @@ class Drawing(_Drawn):
     objects: Annotated[tuple[DrawnObject, ...], Field(min_length=1, max_length=MOST_OBJECTS)]
 
 
-def parse_object(text: bytes) -> DrawnObject:
-    """One object from JSON.
+Sent = TypeVar("Sent", bound=BaseModel)
+
+
+def parse(text: bytes, model: type[Sent], what: str = "drawing", it: str = "it") -> Sent:
+    """What the page has sent as JSON.
+
+    Args:
+        text: The JSON.
+        model: What it is.
+        what: The word for it in messages.
+        it: The pronoun.
 
     Raises:
         InputError: If it is none.
     """
     try:
-        return DrawnObject.model_validate_json(text)
+        return model.model_validate_json(text)
     except ValidationError as error:
-        raise InputError(_in_words(error)) from error
-
-
-def read_drawing(text: bytes) -> Drawing:
-    """All objects from JSON.
-
-    Raises:
-        InputError: If it is no drawing.
-    """
-    try:
-        return Drawing.model_validate_json(text)
-    except ValidationError as error:
-        raise InputError(_in_words(error)) from error
-
-
-def _in_words(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"The drawing cannot be used: {where or 'it'}: {first['msg']}."
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or it
+        raise InputError(f"The {what} cannot be used: {where}: {first['msg']}.") from error

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
-from tracking3d.ui.picker.drawing import parse_object, read_drawing
+from tracking3d.ui.picker.drawing import Drawing, DrawnObject, parse
 from tracking3d.ui.picker.session import (
+    ChosenSettings,
     Picked,
     PickingSession,
-    parse_settings,
     setting_choices,
     settings_in_words,
     tracker_lines,
@@ -167,14 +167,14 @@ class Picker:
         if path == "/view" and self.run.view is not None:
             return {"address": self.run.view()}, _nothing
         if path == "/mask":
-            drawn = parse_object(body)
+            drawn = parse(body, DrawnObject)
             return self.show(self.session.mask(drawn), drawn.colour)
         if path == "/settings":
-            self.session.choose(parse_settings(body))
+            self.session.choose(parse(body, ChosenSettings, "settings", "they"))
             return {"tracker": self.session.config.tracker.name, **_describe_settings(self.session)}, _nothing
         if path not in ("/save", "/start"):
             return None
-        picked = self.session.picked(read_drawing(body))
+        picked = self.session.picked(parse(body, Drawing))
         command, settings = self.save(picked)
         then = partial(self.start, picked) if path == "/start" else _nothing
         return {"command": command, "settings": settings}, then

@@ -6,12 +6,12 @@ import base64
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from tracking3d.config.loading import MODELS, QUALITIES
 from tracking3d.config.models import AUTO, PipelineConfig
@@ -310,17 +310,3 @@ def settings_in_words(config: PipelineConfig) -> dict[str, str]:
         "model": shape.shape if textured or shape.shape == "fine" else "none",
         "features": config.features.name,
     }
-
-
-def parse_settings(text: bytes) -> ChosenSettings:
-    """The settings from JSON.
-
-    Raises:
-        InputError: If they are none.
-    """
-    try:
-        return ChosenSettings.model_validate_json(text)
-    except ValidationError as error:
-        first: Any = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"The settings cannot be used: {where or 'they'}: {first['msg']}.") from error

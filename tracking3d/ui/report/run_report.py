@@ -26,7 +26,7 @@ from tracking3d.results.contact_sheet import look_of, render_view, side_shown
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.layout import partial_path
 from tracking3d.results.mesh_export import load_model, split_mesh
-from tracking3d.results.notes import DoubtfulRange, doubtful_ranges, unseen_share
+from tracking3d.results.notes import unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.concurrency import start_in_thread
@@ -34,9 +34,9 @@ from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.ui.report import figures
 from tracking3d.ui.report.curves import Curve, curve, stretches
 from tracking3d.ui.report.differences import settings_of
-from tracking3d.ui.report.doubts import doubts_of, next_steps, outcome_of
 from tracking3d.ui.report.frame_pictures import FramePictures, frame_pictures, jpeg_of
 from tracking3d.ui.report.rendering import render_page
+from tracking3d.ui.sentences import DoubtfulRange, doubtful_ranges, doubts_of, next_steps, outcome_of
 from tracking3d.video.writer import VideoWriter
 
 _MOST_LISTED = 30

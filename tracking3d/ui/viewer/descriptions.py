@@ -12,8 +12,8 @@ from typing import Any
 from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.results import drawing
 from tracking3d.results.drawing import Colour
-from tracking3d.results.notes import DoubtfulRange, doubtful_ranges
 from tracking3d.results.records import FrameRecord
+from tracking3d.ui.sentences import DoubtfulRange, doubtful_ranges
 from tracking3d.ui.viewer.followed_run import FollowedRun
 from tracking3d.ui.viewer.timeline import hexadecimal, jump
 

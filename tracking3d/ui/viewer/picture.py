@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing
-from tracking3d.results.overlay import ObjectAxes
+from tracking3d.results.overlay import ObjectAxes, draw_axes
+from tracking3d.results.pictures import kept_estimate
 from tracking3d.results.records import FrameRecord
 from tracking3d.ui.viewer.followed_run import FollowedRun
 
@@ -22,7 +22,6 @@ WIDEST = 960
 CAUSAL: drawing.Colour = (255, 120, 230)
 LAYERS = {"initial": drawing.INITIAL, "causal": CAUSAL, "refined": drawing.REFINED}
 """The masks whose outlines can be drawn, and their colours, from the lowest to the uppermost."""
-_AXES: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 120, 255))
 _GREY = 70
 _UNLIKELY = 0.02  # probability up to which a pixel is left as it is
 
@@ -78,7 +77,7 @@ def draw_picture(
                     picture, small.astype(bool), own, thin if layer == "initial" else thin + 1
                 )
         if shown.axes and placed is not None and record is not None and record.status != Status.LOST:
-            _draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
+            draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
     _draw_frame_of_doubt(picture, [run.frames.get(index) for run in runs], 2 * thin + 2)
     return picture
 
@@ -106,7 +105,7 @@ def axes_of(run: FollowedRun) -> ObjectAxes | None:
     for index, record in run.frames.items():
         mask = run.mask(index, "refined")
         if mask is not None and mask.any():
-            return ObjectAxes.of(_estimate(record, mask), record.through(run.camera))
+            return ObjectAxes.of(kept_estimate(record, mask, None, run.camera), record.through(run.camera))
     return None
 
 
@@ -118,19 +117,6 @@ def _add_name(picture: Image, name: str, width: int) -> Image:
     return tile
 
 
-def _estimate(record: FrameRecord, mask: NDArray[np.bool_]) -> FrameEstimate:
-    return FrameEstimate(
-        record.index,
-        record.time,
-        record.T_cam_obj,
-        mask,
-        None,
-        record.status,
-        record.reason,
-        record.confidence,
-    )
-
-
 def _tint(picture: Image, probability: NDArray[np.float32]) -> None:
     """Colour what may be the object, from blue (hardly) over green (open) to yellow (surely)."""
     height, width = picture.shape[:2]
@@ -138,27 +124,6 @@ def _tint(picture: Image, probability: NDArray[np.float32]) -> None:
     colours = cv2.applyColorMap(np.rint(255 * likely).clip(0, 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     share = np.where(likely > _UNLIKELY, 0.55, 0.0)[..., None]
     picture[:] = ((1 - share) * picture + share * colours[..., ::-1]).astype(np.uint8)
-
-
-def _draw_axes(
-    picture: Image,
-    T_cam_obj: NDArray[np.float64],
-    camera: Camera,
-    axes: ObjectAxes,
-    scale: float,
-    thickness: int,
-) -> None:
-    """The axes x red, y green, z blue, the nearest on top; nothing if they reach behind the camera."""
-    ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
-    points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    if not np.isfinite(points).all() or points[:, 2].min() <= 0:
-        return
-    pixels = camera.to_picture((points @ camera.K.T)[:, :2] / points[:, 2:])
-    if not np.isfinite(pixels).all():
-        return
-    start, *tips = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
-    for axis in np.argsort(-points[1:, 2]):
-        cv2.line(picture, start, tips[axis], _AXES[axis], thickness, cv2.LINE_AA)
 
 
 def _draw_frame_of_doubt(picture: Image, records: Iterable[FrameRecord | None], thickness: int) -> None:

@@ -21,21 +21,11 @@ from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results import layout
 from tracking3d.results.drawing import Colour
-from tracking3d.results.notes import doubtful_ranges
 from tracking3d.results.overlay import ObjectAxes
-from tracking3d.ui.viewer import timeline
+from tracking3d.ui.sentences import doubtful_ranges
+from tracking3d.ui.viewer import first_look, timeline
 from tracking3d.ui.viewer.correcting import Corrections
 from tracking3d.ui.viewer.descriptions import about, describe_frame, list_doubtful_frames
-from tracking3d.ui.viewer.first_look import (
-    ASPECT,
-    FOV,
-    NARROW,
-    aside_of,
-    corners_of,
-    frame_object,
-    radius_of,
-    stack_objects,
-)
 from tracking3d.ui.viewer.followed_run import FollowedRun, landmarks_of_checkpoint
 from tracking3d.ui.viewer.guarded_server import start_server
 from tracking3d.ui.viewer.panel import SPEEDS, Panel
@@ -306,7 +296,7 @@ class Viewer:
         any_landmarks = False
         for scene in self._scenes:
             scene.draw_again()
-        places = stack_objects([radius_of(scene.box) for scene in self._scenes])
+        places = first_look.stack_objects([first_look.radius_of(scene.box) for scene in self._scenes])
         for scene, run, place in zip(self._scenes, self._runs, places, strict=True):
             scene.place = np.array([0.0, place, 0.0])
             # From the state of a run that goes on: the final refinement may scale and turn the object.
@@ -365,12 +355,14 @@ def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene], na
         scenes: What is to be in view.
         narrow: Whether the panel is wide, since it shows several videos, and leaves a narrow view.
     """
-    aside = aside_of(scenes[0].path)
-    places = np.concatenate([scene.place + corners_of(scene.box) for scene in scenes])
+    aside = first_look.aside_of(scenes[0].path)
+    places = np.concatenate([scene.place + first_look.corners_of(scene.box) for scene in scenes])
     camera = server.initial_camera
-    camera.look_at, distance = frame_object(places, aside, NARROW if narrow else ASPECT)
+    camera.look_at, distance = first_look.frame_object(
+        places, aside, first_look.NARROW if narrow else first_look.ASPECT
+    )
     camera.position = camera.look_at + distance * aside
-    camera.fov = FOV
+    camera.fov = first_look.FOV
 
 
 def look_through(
@@ -390,8 +382,3 @@ def look_through(
             client.camera.position, client.camera.wxyz = T_world_cam[:3, 3], rotation.wxyz
             wider = max(1.0, aspect / client.camera.aspect)  # what the panels leave may be narrow
             client.camera.fov = float(2 * np.arctan(wider * np.tan(np.radians(fov) / 2)))
-
-
-# Descriptions as HTML: a frame's estimate, the uncertain and lost frames, the run as a whole.
-#
-# All of it is text of files, and escaped.

@@ -11,7 +11,7 @@ from typing import Any
 
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
-from tracking3d.engines.protocol import Began, Ended, Event, Task, Tell
+from tracking3d.engines.protocol import Began, Ended, Event, Reporter, Task
 from tracking3d.errors import Tracking3dError
 from tracking3d_bench.benchmark.job import LOG, Job, run_job
 
@@ -101,7 +101,7 @@ def run_jobs(
     return [outcomes[number] for number in range(len(jobs))]
 
 
-def _run_written(tell: Tell, file: Path) -> None:
+def _run_written(tell: Reporter, file: Path) -> None:
     """What a worker does: the job that was written for it."""
     run_job(Job.read(file))
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from tracking3d.runtime.logistic_model import LogisticModel
+from tracking3d.runtime.logistic_model import Term as LogisticTerm
 from tracking3d_bench.evaluation.arrays import booleans, floats
 
 BOUNDS = 2.0, 98.0
@@ -112,13 +115,11 @@ def fit_confidence(
     return LogisticConfidence(float(intercept), tuple(terms))
 
 
-def as_python_source(confidence: LogisticConfidence) -> str:
-    """The table as Python source: an intercept, and by name weight, low, high and what stands for a missing number."""
-    rows = [
-        f'    "{one.name}": ({one.weight:.4g}, {one.low:.4g}, {one.high:.4g}, {one.missing:.4g}),'
-        for one in confidence.terms
-    ]
-    return "\n".join([f"INTERCEPT = {confidence.intercept:.4g}", "TERMS = {", *rows, "}"])
+def as_logistic_model(confidence: LogisticConfidence, data: str, error: str) -> LogisticModel:
+    """The table as the package keeps it, of today's date, see `LogisticModel`; it has no numbers that are missing."""
+    terms = {one.name: LogisticTerm(one.weight, one.low, one.high) for one in confidence.terms}
+    right = "an estimate is right: within 10 degrees and above an IoU of 0.7"
+    return LogisticModel(right, data, date.today().isoformat(), error, confidence.intercept, terms)
 
 
 def halves(names: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -10,21 +10,29 @@ On a GPU it is the same difference in what torch's allocator has handed out.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 
-from tracking3d.runtime.memory import forget_peak, resident_memory
+from tracking3d.runtime.memory import resident_memory
 from tracking3d_bench.speed.scene import RenderScene, RenderWorkload
 from tracking3d_bench.speed.timing import backends, set_benchmark_threads
 
 ITERATIONS = 3
 _TINY = RenderWorkload(size=16, frames=1, channels=1, texture=8, frequency=2)
 _GIVE_BACK = 128 * 1024  # bytes; blocks of at least this size go back to the system at once
+
+
+def forget_peak() -> None:
+    """Reset the highest resident set size to the present one, if the system supports it (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_memory(name: str, problem: RenderWorkload, device: torch.device, threads: int = 1) -> float:

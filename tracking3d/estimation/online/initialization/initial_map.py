@@ -237,13 +237,8 @@ def _mean_overlap(object_map: ObjectMap) -> float:
     K, size = torch.stack([target.K for target in targets]), targets[0].inside.shape
     screen, depth = project(object_map.vertices, poses.R, poses.translation, K)
     drawn = rasterize(screen, depth, object_map.shape.faces, (size[0], size[1]), object_map.renderer)
-    overlaps = [
-        1.0 if target.mask is None
-        else int((covered & target.mask)[target.inside].sum())
-        / max(int((covered | target.mask)[target.inside].sum()), 1)
-        for covered, target in zip(drawn.face_index >= 0, targets, strict=True)
-    ]  # fmt: skip
-    return float(np.mean(overlaps))
+    pairs = zip(drawn.face_index >= 0, targets, strict=True)
+    return float(np.mean([float(target.overlap(covered)) for covered, target in pairs]))
 
 
 def _fit_survivors(

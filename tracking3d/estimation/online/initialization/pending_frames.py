@@ -240,6 +240,8 @@ def _start_without_points(
     if _last_still_view(views) is None:
         kept = _subsample(waiting) if len(views) >= MOST_WAITING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
+    if state.needs_points:  # given up: its frames have none that last
+        return replace(state, pending=()), None
     if state.feature_space is not None:
         views = [with_contrast(view, state.feature_space.with_contrast()) for view in views]
     return state, initialize_without_points(

@@ -8,6 +8,7 @@ rendering them shows which is correct.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
+from tracking3d.geometry.levenberg_marquardt import Damping, damped, minimizer
 from tracking3d.points.bundle_adjustment.adjustment import (
     AdjustmentProblem,
     Structure,
@@ -377,7 +379,16 @@ _SCREENED_POINTS = 40
 _ITERATIONS = 25
 _STEEPEST = 5.0
 _SAME_TILT = 0.3
-_CONVERGED = 1e-6
+_PLANE_DAMPING = Damping(least=0, most=math.inf, decrease=10, increase=10, converged=1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """Poses and points of a plane."""
+
+    structure: Structure
+    tilt: FloatArray  # (2,) see `_on_plane`
+    cost: float
 
 
 def is_planar(tracks: Tracks, K: FloatArray, threshold: float) -> bool:
@@ -479,22 +490,20 @@ def _fit_plane_structure(
     problem = AdjustmentProblem(
         tracks.pixels, tracks.weights(), K, 1, scale, False, np.zeros_like(points), free
     )
-    best, damping = problem.evaluate(resect_views(tracks, K, points - t0, t0, scale)), 1e-3
-    for _ in range(_ITERATIONS):
-        step = -_plane_step(problem.linearize(best), best.points + t0, offset / z0, damping)
-        moved_points = _on_plane(rays, tilt + step[-2:], z0)
-        if moved_points is None:
-            damping *= 10
-            continue
-        new = problem.evaluate(problem.step_by(best, step[:-2], moved_points - t0 - best.points))
-        if not new.cost < best.cost:
-            damping *= 10
-            continue
-        settled = best.cost - new.cost < _CONVERGED * best.cost
-        best, tilt, damping = new, tilt + step[-2:], damping / 10
-        if settled:
-            break
-    return adjust(tracks, K, replace(best, origin="flat"), scale=scale, iterations=0)
+
+    def stepped(problem: AdjustmentProblem, at: _Plane, system: System, damping: float) -> _Plane:
+        step = -_plane_step(system, at.structure.points + t0, offset / z0, damping)
+        moved = _on_plane(rays, at.tilt + step[-2:], z0)
+        if moved is None:
+            return replace(at, cost=math.inf)
+        shift = moved - t0 - at.structure.points
+        new = problem.evaluate(problem.step_by(at.structure, step[:-2], shift))
+        return _Plane(new, at.tilt + step[-2:], new.cost)
+
+    first = problem.evaluate(resect_views(tracks, K, points - t0, t0, scale))
+    minimize = minimizer(lambda problem, at: problem.linearize(at.structure), stepped)
+    best, _ = minimize(problem, _Plane(first, tilt, first.cost), _PLANE_DAMPING, _ITERATIONS)
+    return adjust(tracks, K, replace(best.structure, origin="flat"), scale=scale, iterations=0)
 
 
 def _plane_step(system: System, place: FloatArray, offset: FloatArray, damping: float) -> FloatArray:
@@ -511,10 +520,7 @@ def _plane_step(system: System, place: FloatArray, offset: FloatArray, damping: 
     corner = np.einsum("nik,nij,njl->kl", by_tilt, system.points, by_tilt)
     matrix = np.block([[system.poses, border], [border.T, corner]])
     gradient = np.append(system.poses_gradient, np.einsum("njk,nj->k", by_tilt, system.points_gradient))
-    diagonal = matrix.diagonal()
-    step: FloatArray = np.linalg.solve(
-        matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-12), gradient
-    )
+    step: FloatArray = np.linalg.solve(damped(matrix, damping), gradient)
     return step
 
 

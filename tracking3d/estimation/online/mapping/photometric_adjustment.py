@@ -8,6 +8,7 @@ revolution: the shape moves by its profile, and the axis is fixed in place of th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.shape import flatten, unfold
+from tracking3d.geometry.levenberg_marquardt import Damping, minimizer
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
@@ -34,13 +36,8 @@ from tracking3d.rendering.surface import edges_of
 _APPEARANCE = 4.0  # weight of the mean photometric loss
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e3
-_DAMPING_DECREASE, _DAMPING_INCREASE = (
-    2.0,
-    4.0,
-)  # factors of the damping after a successful step and after a rejected one
-_MIN_GAIN = 1e-4  # share of the cost below which a gain is small
-_MAX_SMALL_GAINS = 3  # in a row end the search; a single one often means only that the damping was too high
+# A single small gain often means only that the damping was too high
+_DAMPING = Damping(first=1e-2, least=1e-5, decrease=2, increase=4, small_gains=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +108,12 @@ def fit_jointly(
     if axis is not None:
         modes, tied = axis.basis(object_map.vertices)
     problem = replace(_problem(object_map, modes, weights), tied=tied)
-    free = torch.ones(problem.unknowns, dtype=torch.bool)
-    if axis is None:
-        free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
-    state = _minimize(problem, free, iterations)
-    poses = from_matrix(state.R, state.t)
+    poses = Pose.stack([view.pose for view in object_map.keyframes])
+    start = _evaluate(problem, object_map.vertices, poses.R, poses.translation)
+    state, _ = minimizer(_linearize, _step)(problem, start, _DAMPING, iterations)
+    fitted = from_matrix(state.R, state.t)
     keyframes = tuple(
-        replace(view, pose=poses[n], texture=None) for n, view in enumerate(object_map.keyframes)
+        replace(view, pose=fitted[n], texture=None) for n, view in enumerate(object_map.keyframes)
     )
     return replace(object_map, vertices=state.vertices, keyframes=keyframes), state.cost
 
@@ -160,35 +156,12 @@ def _problem(object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights) -> _
     )
 
 
-def _minimize(problem: _Problem, free: Tensor, iterations: int) -> _State:
-    """The best state that Levenberg-Marquardt reaches in the free unknowns."""
-    poses = Pose.stack([view.pose for view in problem.object_map.keyframes])
-    state = _evaluate(problem, problem.object_map.vertices, poses.R, poses.translation)
-    equations: _Equations | None = None
-    damping, small = _DAMPING, 0
-    for _ in range(iterations):
-        equations = equations or _linearize(problem, state)
-        trial = _step(problem, state, equations, free, damping)
-        if trial is not None and trial.cost < state.cost:
-            gain = state.cost - trial.cost
-            state, equations, damping = trial, None, max(damping / _DAMPING_DECREASE, _LEAST_DAMPING)
-            small = small + 1 if gain < _MIN_GAIN * state.cost else 0
-            if small == _MAX_SMALL_GAINS:
-                break
-        else:
-            damping *= _DAMPING_INCREASE
-            if damping > _MOST_DAMPING:
-                break
-    return state
-
-
-def _step(
-    problem: _Problem, state: _State, equations: _Equations, free: Tensor, damping: float
-) -> _State | None:
-    """The state after one step; None if there is none."""
+def _step(problem: _Problem, state: _State, equations: _Equations, damping: float) -> _State:
+    """The state after one step; at infinite cost if there is none."""
     # The light is fitted again at every state: its part of the step is only what the others must allow for.
-    free = free.clone()
-    free[problem.shape_unknowns + 6 * len(problem.K) :] = True
+    free = torch.ones(problem.unknowns, dtype=torch.bool)
+    if problem.tied is None:
+        free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
     matrix, gradient = equations.matrix, equations.gradient
     if problem.tied is not None:
         tied = torch.block_diag(problem.tied, torch.eye(len(free) - len(problem.tied)).to(problem.tied))
@@ -198,7 +171,7 @@ def _step(
     diagonal += damping * diagonal + 1e-7 * diagonal.max()
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if failed:
-        return None
+        return replace(state, cost=math.inf)
     step = torch.zeros_like(gradient)
     step[free] = torch.cholesky_solve(-gradient[free, None], factor)[:, 0]
     step = step if problem.tied is None else tied @ step

@@ -12,8 +12,8 @@ import math
 import cv2
 import numpy as np
 
-from tracking3d.estimation.online.optimization.types import PnPFit, PoseHypothesis
-from tracking3d.points.bundle_adjustment.reprojection import FloatArray, finite_rows
+from tracking3d.estimation.online.optimization.types import PoseHypothesis
+from tracking3d.points.bundle_adjustment.reprojection import EvaluatedPose, FloatArray, finite_rows
 
 _MIN_INLIERS = 4
 _SAMPLES = 500
@@ -64,7 +64,7 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int = 10,
-) -> PnPFit:
+) -> EvaluatedPose:
     """The pose of least robust reprojection error near an initial pose; never worse than it.
 
     Args:
@@ -117,7 +117,7 @@ def _refine_on_inliers(
     for _ in range(_REFINEMENTS):
         fit = pose_of_tracks(points, pixels, None, K, R, t, threshold / 2)
         R, t = fit.R, fit.t
-    residual = fit.equations.residual
+    residual = fit.details
     inliers = residual <= threshold
     rms = math.sqrt(np.mean(residual[inliers] ** 2)) if inliers.any() else math.inf
     return PoseHypothesis(R, t, inliers, rms)

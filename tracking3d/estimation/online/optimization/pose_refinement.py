@@ -16,19 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.optimization.types import (
-    ENOUGH,
-    FIRST_DAMPING,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    NOTHING_SEEN,
-    EvaluatedPoses,
-    PoseFit,
-    PoseWeights,
-)
+from tracking3d.estimation.online.optimization.types import NOTHING_SEEN, PoseFit, PoseWeights
+from tracking3d.geometry.levenberg_marquardt import Damping, minimizer
 from tracking3d.geometry.pose import Pose, from_matrix
-from tracking3d.points.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
-from tracking3d.rendering import MatchedPoints, Scales, Surface, pose_terms
+from tracking3d.points.bundle_adjustment.reprojection import EvaluatedPose, FloatArray, apply_pose_steps
+from tracking3d.rendering import MatchedPoints, NormalEquations, Scales, Surface, pose_terms
 from tracking3d.rendering.backend import use_numba
 
 _DEFAULT_WEIGHTS = PoseWeights()
@@ -38,6 +30,7 @@ _DEFAULT_WEIGHTS = PoseWeights()
 class _Evidence:
     """The evidence that poses are fitted to, at one resolution."""
 
+    surface: Surface
     observation: Observation  # the frame at this resolution
     matched: MatchedPoints | None  # with pixels of this resolution; None without any
     weights: PoseWeights  # with scales in pixels of this resolution
@@ -49,7 +42,7 @@ class _Evidence:
             matched = replace(matched, pixels=(matched.pixels + 0.5) / 2 - 0.5)
         outline, points = weights.outline_scale / 2, weights.points_scale / 2
         weights = replace(weights, outline_scale=outline, points_scale=points)
-        return _Evidence(self.observation.half, matched, weights)
+        return _Evidence(self.surface, self.observation.half, matched, weights)
 
 
 def refine_pose(
@@ -85,59 +78,53 @@ def refine_poses(
     """
     if not starts:
         return []
-    levels = [_Evidence(observation, matched if matched is not None and len(matched) else None, weights)]
+    points = matched if matched is not None and len(matched) else None
+    levels = [_Evidence(surface, observation, points, weights)]
     for _ in iterations[1:]:
         levels.append(levels[-1].half())
-    R = torch.stack([pose.R for pose in starts]).cpu().double().numpy()
-    t = torch.stack([pose.translation for pose in starts]).cpu().double().numpy()
-    spent, moving = np.zeros(len(starts), np.int64), np.zeros(len(starts), bool)
+    first_R = torch.stack([pose.R for pose in starts]).cpu().double().numpy()
+    first_t = torch.stack([pose.translation for pose in starts]).cpu().double().numpy()
+    R, t, spent = first_R, first_t, np.zeros(len(starts), np.int64)
     for level, steps in zip(levels[::-1], iterations, strict=True):
         if steps or level is levels[0]:
-            found = _minimize(surface, level, R, t, steps)
-            R, t, spent, moving = found.R, found.t, spent + found.spent, moving | found.moved
+            found, tried = zip(*_minimize(level, R, t, steps), strict=True)
+            R, t = (np.stack(part) for part in ([fit.R for fit in found], [fit.t for fit in found]))
+            spent += 1 + np.array(tried)
+    moved = np.not_equal(R, first_R).any((1, 2)) | np.not_equal(t, first_t).any(1)
     return [
-        found.fit(n, _pose(surface, R[n], t[n]) if moving[n] else start, int(spent[n]))
-        for n, start in enumerate(starts)
+        PoseFit.of(fit, from_matrix(*_on_device(surface, fit.R, fit.t)) if moved[n] else start, int(spent[n]))
+        for n, (start, fit) in enumerate(zip(starts, found, strict=True))
     ]
 
 
 def _minimize(
-    surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int
-) -> EvaluatedPoses:
-    """Levenberg-Marquardt at one resolution, in which no cost ever rises."""
-    target, weights = evidence.observation.target, evidence.weights
+    evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int
+) -> list[tuple[EvaluatedPose, int]]:
+    """Poses ``(B, 3, 3)`` and ``(B, 3)`` fitted at one resolution, with the numbers of steps tried."""
+    surface, target = evidence.surface, evidence.observation.target
     if use_numba(surface.renderer, surface.vertices, surface.texture, target.features):
         from tracking3d.estimation.online.optimization.kernels import pose_refinement
 
-        return pose_refinement.minimize(surface, target, evidence.matched, weights, R, t, steps)
-    best = _evaluate(surface, evidence, R, t)
-    going, damping = np.arange(len(R)), np.full(len(R), FIRST_DAMPING)
-    for _ in range(steps):
-        present = best[going]
-        trial = _evaluate(
-            surface, evidence, *apply_pose_steps(present.R, present.t, present.steps(damping[going]))
-        )
-        trial.moved[:] = True
-        gain = present.cost - trial.cost
-        better = gain > 0
-        spent = best.spent[going] + 1
-        best[going[better]] = trial[better]
-        best.spent[going] = spent
-        damping[going] = np.where(better, np.maximum(damping[going] / 4, LEAST_DAMPING), damping[going] * 8)
-        ends = np.where(better, gain < ENOUGH * present.cost, damping[going] > MOST_DAMPING)
-        going = going[~ends]
-        if not len(going):
-            break
-    return best
+        return pose_refinement.minimize(surface, target, evidence.matched, evidence.weights, R, t, steps)
+    minimize = minimizer(_model, _step)
+    return [minimize(evidence, start, Damping(), steps) for start in _evaluate(evidence, R, t)]
 
 
-def _evaluate(surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray) -> EvaluatedPoses:
+def _model(evidence: _Evidence, at: EvaluatedPose) -> NormalEquations:
+    parts = (torch.from_numpy(np.asarray(part)[None]) for part in (at.matrix, at.gradient, at.cost))
+    return NormalEquations(*parts)
+
+
+def _step(evidence: _Evidence, at: EvaluatedPose, model: NormalEquations, damping: float) -> EvaluatedPose:
+    return _evaluate(evidence, *apply_pose_steps(at.R[None], at.t[None], model.step(damping).numpy()))[0]
+
+
+def _evaluate(evidence: _Evidence, R: FloatArray, t: FloatArray) -> list[EvaluatedPose]:
     """Poses with their costs and normal equations."""
-    weights = evidence.weights
+    surface, weights = evidence.surface, evidence.weights
     scales = Scales(weights.appearance_scale, weights.outline_scale, weights.points_scale)
-    terms = pose_terms(
-        surface, evidence.observation.target, *_on_device(surface, R, t), evidence.matched, scales
-    )
+    target, poses = evidence.observation.target, _on_device(surface, R, t)
+    terms = pose_terms(surface, target, *poses, evidence.matched, scales)
     comparable = terms.comparable.numpy()
     nothing = comparable == 0
     unseen = np.where(nothing, 1.0, 1 - terms.known.numpy() / np.where(nothing, 1.0, comparable))
@@ -152,14 +139,9 @@ def _evaluate(surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArra
         + terms.points * weights.points
     )
     cost = weights.appearance * appearance + weights.outline * outline + weights.points * points
-    return EvaluatedPoses(
-        R, t, cost, appearance, outline, points, terms.overlap.numpy(), unseen, model.matrix.numpy(),
-        model.gradient.numpy(), np.ones(len(R), np.int64), np.zeros(len(R), bool),
-    )  # fmt: skip
-
-
-def _pose(surface: Surface, R: FloatArray, t: FloatArray) -> Pose:
-    return from_matrix(*_on_device(surface, R, t))
+    details = np.column_stack([appearance, outline, points, terms.overlap.numpy(), unseen])
+    parts = cost.tolist(), R, t, details, model.matrix.numpy(), model.gradient.numpy()
+    return [EvaluatedPose(*each) for each in zip(*parts, strict=True)]
 
 
 def _on_device(surface: Surface, R: FloatArray, t: FloatArray) -> tuple[Tensor, Tensor]:

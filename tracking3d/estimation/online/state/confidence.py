@@ -15,24 +15,16 @@ from tracking3d.estimation.online.optimization.pose_refinement import TURN, leas
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.frames import TRACKED_CONFIDENCE
+from tracking3d.runtime.logistic_model import LogisticModel
 
 ENOUGH_POINTS = 15
 """Inliers that settle a pose, whatever the appearance says."""
 _UNSEEN_CHARGE = PoseWeights().unseen
 _FULL_WEIGHT_TEXTURE = 0.8  # share of known texture from which the appearance counts in full
 _MOSTLY_UNSEEN = 0.7  # share of unseen texture
-_INTERCEPT = 1.6
-_TERMS = {  # weight, and the range that was seen
-    "missed": (-6.219, 0.0, 0.5394),
-    "unseen_ratio": (-3.339, 0.00157, 0.5698),
-    "outlier_ratio": (-0.6459, 0.0, 0.3333),
-    "deviation": (-1.0, math.log(0.05), math.log(10.0)),
-}
+_MODEL, _FREE_AXIS = LogisticModel.load("pose_confidence"), LogisticModel.load("free_axis_confidence")
 # What is rendered counts as four points with a loss of .3 (fitted): without inliers the curvature alone decides
 _RENDERED_POINTS, _RENDERED_LOSS = 4, 0.3
-# Intercept, and weight of the missed overlap, for a surface of revolution about a free axis, which cannot adapt to what
-# contradicts it: tracked from an overlap of .9 (chosen; of 102 keyframes of six maps, all above .89, one was wrong)
-_FREE_AXIS = (4.2, -28.0)
 _REASONS = {
     "missed": "the silhouette and the mask overlap too little (IoU {fit.overlap:.2f})",
     "unseen_ratio": "much of what is visible has not been seen before (ratio {fit.unseen:.2f})",
@@ -164,20 +156,14 @@ def is_misfit(fit: PoseFit, baseline: LossBaseline) -> bool:
 def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 
-    Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
-    of the suite ``fresh`` of seed 9101; intercept and deviation were fitted again to small turns and rests.
-    history/2026-11-28-confidence-with-points.md has its calibration on others.
-    Rotation about a free axis does not count.
+    Right means within 10 degrees and above an IoU of 0.7. Rotation about a free axis does not count.
+    history/2026-11-28-confidence-with-points.md has its calibration.
     """
-    odds = _INTERCEPT + sum(_log_odds(fit, evidence).values())
-    if evidence.free_axis is not None:
-        odds = _FREE_AXIS[0] + _FREE_AXIS[1] * evidence.mask_weight * (1 - fit.overlap)
-    return 1 / (1 + math.exp(-odds))
+    return (_MODEL if evidence.free_axis is None else _FREE_AXIS).probability(_features(fit, evidence))
 
 
-def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
-    """What each feature adds to the log-odds of being right."""
-    features = confidence_features(
+def _features(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
+    return confidence_features(
         {"appearance": fit.appearance, "outline": fit.outline, "points": fit.points},
         {
             "inliers": evidence.inliers,
@@ -188,9 +174,6 @@ def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
             "mask_confidence": evidence.mask_weight,
         },
     )
-    return {
-        name: weight * min(max(features[name], low), high) for name, (weight, low, high) in _TERMS.items()
-    }
 
 
 def is_high_loss(fit: PoseFit, baseline: LossBaseline, mask_weight: float) -> bool:
@@ -258,8 +241,11 @@ def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
         return "a new side: only the outline and the motion model constrain the pose"
     if evidence.free_axis is not None:
         return _REASONS["missed"].format(fit=fit)
-    odds = _log_odds(fit, evidence)
-    best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
+    odds = _MODEL.log_odds(_features(fit, evidence))
+    best = {
+        name: term.weight * (term.high if term.weight > 0 else term.low)
+        for name, term in _MODEL.terms.items()
+    }
     worst = max(odds, key=lambda name: best[name] - odds[name])
     if worst == "deviation" and evidence.untextured:
         found = "no points that last" if evidence.has_texture else "hardly any texture"

@@ -62,6 +62,8 @@ class _AnyState:
     feature_space: FeatureSpace | None = None
     # poses (4, 4) that frames are refined from in place of their causal ones, by frame index
     extended: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    # the map that is computed in another thread, if there is one; see `tracking3d.estimation.online.initializer`
+    background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,9 +80,7 @@ class Initializing(_AnyState):
     # (3,) the object's rotation in that initialization as a rotation vector, or None
     ambiguous_rotation: NDArray[np.float64] | None = None
     waiting_reason: str = ""  # why the initialization waits, if not for motion
-    # the initialization that is computed in another thread, if there is one; see
-    # `tracking3d.estimation.online.initializer`
-    background: BackgroundAttempt[Any, tuple[Keyframe, FrameEstimate], FrameEstimate] | None = None
+    needs_points: bool = False  # whether a map without points is of no use, as beside another map
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

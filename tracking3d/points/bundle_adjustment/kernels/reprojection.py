@@ -1,12 +1,17 @@
-"""A point's pixel and its derivatives, and small linear systems, for other kernels."""
+"""A point's pixel and its derivatives, small linear systems, and the fit of one pose, for other kernels."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba
+import numpy as np
 
+from tracking3d.geometry.levenberg_marquardt import minimizer
+from tracking3d.points.bundle_adjustment.reprojection import EvaluatedPose
 from tracking3d.rendering.kernels.compilation import OPTIONS
 
 shared = numba.njit(**OPTIONS)
@@ -82,3 +87,37 @@ def solve_factorised(factor, right):
         for k in range(i + 1, size):
             right[i] -= factor[k, i] * right[k]
         right[i] /= factor[i, i]
+
+
+@shared
+def _model(problem, at):
+    return at
+
+
+def pose_minimizer(evaluate: Callable[..., Any], floor: float = 1e-12) -> Callable[..., Any]:
+    """The loop over one pose, see `minimizer`.
+
+    Args:
+        evaluate: Makes an `EvaluatedPose` of problem, ``R`` and ``t``.
+        floor: What the diagonal has at least.
+    """
+
+    @shared
+    def step(problem, at, model, damping):
+        largest = 0.0
+        for row in range(6):
+            largest = max(largest, model.matrix[row, row])
+        system, moved = model.matrix.copy(), -model.gradient
+        for row in range(6):
+            system[row, row] += damping * model.matrix[row, row] + 1e-9 * largest + floor
+        sound = factorize(system)
+        if sound:
+            solve_factorised(system, moved)
+            sound = np.isfinite(moved).all()
+        if not sound:
+            return EvaluatedPose(math.inf, at.R, at.t, at.details, at.matrix, at.gradient)
+        R = np.empty((3, 3))
+        rotate_by(moved[3], moved[4], moved[5], at.R, R)
+        return evaluate(problem, R, at.t + moved[:3])
+
+    return shared(minimizer(_model, step))

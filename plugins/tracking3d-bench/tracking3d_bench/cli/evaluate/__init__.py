@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.batch import WithDefault
+from tracking3d.cli.program import WithDefault
 from tracking3d_bench.cli.evaluate import answers, compare, model, peer, spread, suite, table
 
 DEFAULT = "answers"

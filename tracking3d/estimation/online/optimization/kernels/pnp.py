@@ -1,24 +1,21 @@
-"""Kernel of `tracking3d.estimation.online.optimization.pnp`: Levenberg-Marquardt over one pose in one call."""
+"""Kernel of `tracking3d.estimation.online.optimization.pnp`: one pose is fitted in one call."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from tracking3d.estimation.online.optimization.types import CONVERGED, PnPFit, PointEquations
-from tracking3d.estimation.online.optimization.types import PNP_FIRST_DAMPING as FIRST_DAMPING
-from tracking3d.estimation.online.optimization.types import PNP_MOST_DAMPING as MOST_DAMPING
+from tracking3d.estimation.online.optimization.types import PNP_DAMPING
 from tracking3d.points.bundle_adjustment.kernels.reprojection import (
-    factorize,
     pixel_motion,
-    rotate_by,
+    pose_minimizer,
     shared,
-    solve_factorised,
     to_camera,
 )
-from tracking3d.points.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
+from tracking3d.points.bundle_adjustment.reprojection import BEHIND, NEAREST, EvaluatedPose, FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 
 
@@ -31,68 +28,31 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int,
-) -> PnPFit:
+) -> EvaluatedPose:
     """See `tracking3d.estimation.online.optimization.pnp`; ``share`` sums to 1 and is 0 for rows without use."""
     given = (np.ascontiguousarray(part, np.float64) for part in (points, pixels, share, K))
-    start = (np.array(part, np.float64, order="C") for part in (R, t))  # written to
-    R, t, *equations = _pose_of_tracks(*given, *start, float(scale), iterations)
-    return PnPFit(R, t, PointEquations(*equations))
+    start = (np.array(part, np.float64, order="C") for part in (R, t))  # may be what is returned
+    return EvaluatedPose(*_pose_of_tracks(*given, *start, float(scale), iterations))
 
 
-@kernel(
-    "Tuple((float64[:,::1], float64[::1], float64[:,::1], float64[::1], float64, float64[::1]))("
-    "float64[:,::1], float64[:,::1], float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64, int64)"
-)
-def _pose_of_tracks(points, pixels, share, K, R, t, scale, iterations):
-    matrix, gradient, residual = np.empty((6, 6)), np.empty(6), np.empty(len(points))
-    cost = _equations(points, pixels, share, K, R, t, scale, matrix, gradient, residual)
-    R_new, t_new, damping = np.empty((3, 3)), np.empty(3), FIRST_DAMPING
-    system, step = np.empty((6, 6)), np.empty(6)
-    new_matrix, new_gradient, new_residual = np.empty((6, 6)), np.empty(6), np.empty(len(points))
-    for _ in range(iterations):
-        largest = 0.0
-        for row in range(6):
-            largest = max(largest, matrix[row, row])
-        for row in range(6):
-            step[row] = -gradient[row]
-            for column in range(6):
-                system[row, column] = matrix[row, column]
-            system[row, row] += damping * matrix[row, row] + 1e-9 * largest + 1e-12
-        new_cost = math.inf
-        if factorize(system):
-            solve_factorised(system, step)
-            rotate_by(step[3], step[4], step[5], R, R_new)
-            for row in range(3):
-                t_new[row] = t[row] + step[row]
-            new_cost = _equations(
-                points, pixels, share, K, R_new, t_new, scale, new_matrix, new_gradient, new_residual
-            )
-        if not new_cost < cost:
-            damping = min(10 * damping, MOST_DAMPING)
-            continue
-        settled = cost - new_cost < CONVERGED * cost
-        cost, damping = new_cost, damping / 10
-        R, R_new, t, t_new = R_new, R, t_new, t
-        matrix, new_matrix, gradient, new_gradient = new_matrix, matrix, new_gradient, gradient
-        residual, new_residual = new_residual, residual
-        if settled:
-            break
-    return R, t, matrix, gradient, cost, residual
+class _Tracks(NamedTuple):
+    points: FloatArray
+    pixels: FloatArray
+    share: FloatArray
+    K: FloatArray
+    scale: float
 
 
 @shared
-def _equations(points, pixels, share, K, R, t, scale, matrix, gradient, residual):
-    """Write the normal equations and each point's distance; the mean loss."""
+def _evaluate(tracks, R, t):
+    """The pose with its mean loss and each point's distance."""
+    points, pixels, share, K, scale = tracks
+    matrix, gradient, residual = np.zeros((6, 6)), np.zeros(6), np.full(len(points), math.nan)
     x_cam, difference = np.empty(3), np.empty(2)
     by_point, by_pose = np.empty((2, 3)), np.empty((2, 6))
     focal = np.array((K[0, 0], K[1, 1]))
     cost = 0.0
-    for i in range(6):
-        gradient[i] = 0.0
-        for j in range(6):
-            matrix[i, j] = 0.0
     for n in range(len(points)):
-        residual[n] = math.nan
         if share[n] == 0:
             continue
         to_camera(R, t, points[n], x_cam)
@@ -115,4 +75,17 @@ def _equations(points, pixels, share, K, R, t, scale, matrix, gradient, residual
     for i in range(6):
         for j in range(i):
             matrix[j, i] = matrix[i, j]
-    return cost
+    return EvaluatedPose(cost, R, t, residual, matrix, gradient)
+
+
+_minimize = pose_minimizer(_evaluate)
+
+
+@kernel(
+    "Tuple((float64, float64[:,::1], float64[::1], float64[::1], float64[:,::1], float64[::1]))("
+    "float64[:,::1], float64[:,::1], float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64, int64)"
+)
+def _pose_of_tracks(points, pixels, share, K, R, t, scale, iterations):
+    tracks = _Tracks(points, pixels, share, K, scale)
+    best, _ = _minimize(tracks, _evaluate(tracks, R, t), PNP_DAMPING, iterations)
+    return best.cost, best.R, best.t, best.details, best.matrix, best.gradient
