@@ -47,18 +47,25 @@ class Observation:
         return downsample(self)
 
     @cached_property
+    def completed_mask(self) -> Tensor:
+        """``(S, S)`` the mask in [0, 1], behind an occluder that of its convex hull."""
+        if self.occluder is None or not self.has_mask:
+            return self.mask
+        covered = self.occluder > 0.5
+        hull = torch.from_numpy(convex_hull((self.mask > 0.5).cpu().numpy())).to(covered.device)
+        return torch.where(hull & covered, 1.0, self.mask)
+
+    @cached_property
     def outline_distance(self) -> Tensor:
         """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`.
 
         Behind an occluder the outline is that of the mask's convex hull, at a lower weight: a surface that is free
         there grows sheets, and the occluder's outline is not the object's.
         """
+        distance = outline_distance(self.completed_mask, self.valid)
         if self.occluder is None or not self.has_mask:
-            return outline_distance(self.mask, self.valid)
-        covered = self.occluder > 0.5
-        hull = torch.from_numpy(convex_hull((self.mask > 0.5).cpu().numpy())).to(covered.device)
-        distance = outline_distance(torch.where(hull & covered, 1.0, self.mask), self.valid)
-        return torch.where(covered, _HULL_SHARE * distance, distance)
+            return distance
+        return torch.where(self.occluder > 0.5, _HULL_SHARE * distance, distance)
 
     @cached_property
     def free_outline_distance(self) -> Tensor:

@@ -1,15 +1,26 @@
-"""A final refinement is taken only where it re-renders the keyframes better than what there was."""
+"""A final refinement is taken only where it re-renders the keyframes better than what there was.
+
+A map without points is fitted to keyframes from all of the video before that.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
-from turned_solid import CAMERA, turned_map
+import torch
+import trimesh
+from turned_solid import CAMERA, degrees_apart, turned_map
 
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.mapping import global_refinement
-from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost, refine_globally
+from tracking3d.estimation.online.mapping.global_refinement import (
+    keyframe_cost,
+    refine_globally,
+    refit_without_points,
+)
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 ANGLES = [0.0, 12.0, 24.0, 36.0]
@@ -68,3 +79,25 @@ def test_a_given_lens_stays(object_map, monkeypatch):
     monkeypatch.setattr(global_refinement, "refine_local_map", lambda one, *_, **__: one)
     monkeypatch.setattr(global_refinement, "solve_lens", solve_lens)
     assert refine_globally(object_map, CAMERA, OnlineConfig())[1] is CAMERA
+
+
+def test_a_surface_that_earlier_poses_have_bent_is_fitted_from_the_prototype():
+    truth = turned_map([15.0 * n for n in range(10)])
+    solid = trimesh.Trimesh(truth.vertices, truth.shape.faces, process=False)
+
+    def distance(vertices):
+        return trimesh.proximity.closest_point_naive(solid, vertices.numpy())[1].mean()
+
+    bent = truth.vertices + 0.25 * torch.sin(7 * truth.vertices[:, [1, 2, 0]])
+    found = refit_without_points(replace(truth, vertices=bent), FitWeights())
+    assert distance(found.vertices) < 0.4 * distance(bent)
+    poses = zip(found.keyframes, truth.keyframes, strict=True)
+    assert max(degrees_apart(one.pose, true.pose) for one, true in poses) < 8
+
+
+def test_keyframes_from_all_of_the_video_stay(monkeypatch):
+    monkeypatch.setattr(global_refinement, "fit_jointly", lambda one, *_: (one, 1.0))
+    found = refit_without_points(turned_map([3.0 * n for n in range(40)]), FitWeights())
+    indices = [view.index for view in found.keyframes]
+    assert indices[0] == 0 and indices[-1] == 78  # every second frame of them is a keyframe
+    assert len(indices) == 16 and max(b - a for a, b in pairwise(indices)) <= 6

@@ -20,12 +20,21 @@ CROP = load_config(preset="default").crop
 
 
 def drawn(
-    *, covered: float = 0.0, wide: float = 1.0, light: float = 1.0, warp=None, noise: int | None = None
+    *,
+    covered: float = 0.0,
+    thumb: int | None = None,
+    known: bool = True,
+    wide: float = 1.0,
+    light: float = 1.0,
+    warp=None,
+    noise: int | None = None,
 ):
     """An observation of a shaded shape without symmetry.
 
     Args:
         covered: Share of its height that something hides from below.
+        thumb: Row at which a thumb lies on it from the left.
+        known: Whether the thumb is known to be in front of it.
         wide: Factor of its width, as if it turned.
         light: Factor of its brightness.
         warp: ``(2, 3)`` of the whole image.
@@ -40,6 +49,10 @@ def drawn(
     image = np.where(mask > 0, shaded, image)
     if covered:
         mask[round(190 - 140 * covered) :] = 0
+    occluder = np.zeros(image.shape, bool)
+    if thumb is not None:
+        occluder[thumb : thumb + 30, :165] = True
+        mask[occluder], image[occluder] = 0, 150
     if warp is not None:
         image = cv2.warpAffine(image, warp, (WIDTH, HEIGHT), borderValue=90)
         mask = cv2.warpAffine(mask, warp, (WIDTH, HEIGHT))
@@ -49,7 +62,7 @@ def drawn(
     box = mask_box(binary)
     assert box is not None
     window = Window.around(box, CROP.margin, CROP.size)
-    frame = Frame(0, np.repeat(image[:, :, None], 3, axis=2))
+    frame = Frame(0, np.repeat(image[:, :, None], 3, axis=2), occluder=occluder if known else None)
     return observe(frame, binary, window, CAMERA, RgbEncoder(), torch.device("cpu"))
 
 
@@ -74,6 +87,17 @@ def test_an_object_that_turns_changes_its_outline():
 
 def test_a_hand_that_covers_a_part_changes_the_outline():
     assert image_change(drawn(), drawn(covered=0.3)).outline > 0.1
+
+
+def test_a_thumb_that_moves_is_no_change_where_it_is_known_to_be_in_front():
+    unknown, known = (
+        image_change(drawn(thumb=100, known=seen), drawn(thumb=112, known=seen)) for seen in (False, True)
+    )
+    assert unknown.outline > 0.05
+    assert known.outline < 0.01
+    assert known.shading < 0.01
+    turned = image_change(drawn(thumb=100), drawn(thumb=112, wide=0.85))
+    assert turned.outline > 0.05
 
 
 def test_another_light_changes_the_shading_and_not_the_outline():

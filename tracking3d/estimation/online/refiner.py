@@ -22,7 +22,7 @@ from tracking3d.estimation.online.features.klt import FollowedPoints, grey
 from tracking3d.estimation.online.initialization.initial_map import restart_without_points
 from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens, with_focal_length
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
-from tracking3d.estimation.online.mapping.global_refinement import refine_globally
+from tracking3d.estimation.online.mapping.global_refinement import refine_globally, refit_without_points
 from tracking3d.estimation.online.mapping.keyframe_insertion import prune_landmarks
 from tracking3d.estimation.online.mapping.local_mapping import refine_map
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
@@ -48,13 +48,17 @@ _BUNDLE_ITERATIONS, _ROUNDS = 15, 2
 def refine_active_map(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state for the final estimates, its active map refined with all keyframes and the focal length if assumed."""
     object_map, camera = state.object_map, state.camera
-    if object_map.pointless and not object_map.fixed_keyframes:
-        weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
+    weights, others = FitWeights(smoothness=config.smoothness), [view for view, _ in state.revisable]
+    plain = object_map.pointless and not object_map.fixed_keyframes
+    if plain:
         object_map = as_surface_of_revolution(object_map, weights, others)
         if object_map.free_axis is None:
             object_map = restart_without_points(object_map, camera, weights)
             object_map = as_surface_of_revolution(object_map, weights, others)
-    object_map, camera = refine_globally(object_map, camera, config)
+    if plain and object_map.free_axis is None:
+        object_map = refit_without_points(object_map, weights)
+    else:
+        object_map, camera = refine_globally(object_map, camera, config)
     return replace(
         _with_final_map(state, object_map, camera),
         unaligned=False,

@@ -40,16 +40,12 @@ from tracking3d.points.bundle_adjustment.adjustment import Structure
 from tracking3d.rendering import project, rasterize
 
 _VIEWS = 8
-_ROTATION_FRAMES = (
-    12  # frames after the first for an initialization without points: mostly a rotation of 30 to 60 degrees
-)
+_ROTATION_FRAMES = 12  # after the first, for a start without points: mostly a rotation of 30 to 60 degrees
 _ROTATION_VIEWS = 7
 _MIN_ROTATION_VIEWS = 4
 _FOCAL_LENGTH_PENALTY = 0.1  # share of the cost added to a map with twice or half the assumed focal length
-_MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
-    6,
-    2.0,
-)  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
+# Structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
+_MAX_STRUCTURES, _MAX_BUNDLE_RATIO = 6, 2.0
 _FIRST_EVALUATIONS = 5  # of each hypothesis, at half resolution
 _VARIED, _SURVIVORS = 4, 5  # hypotheses that are varied, and that are fitted further (measured)
 # Evaluations, whether at half resolution, and how many survivors take part (measured: with five the same winners)

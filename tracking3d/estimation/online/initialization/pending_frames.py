@@ -359,8 +359,13 @@ class ImageChange:
 
 
 def image_change(first: Observation, second: Observation) -> ImageChange:
-    """The change from one observation of an object to another, both with a mask, as the masks' similarity leaves it."""
-    mask_a, mask_b = (np.ascontiguousarray(one.mask.cpu().numpy(), np.float32) for one in (first, second))
+    """The change from one observation of an object to another, both with a mask, as the masks' similarity leaves it.
+
+    What covers the object in either of them is left out: a thumb that moves is no turn.
+    """
+    mask_a, mask_b = (
+        np.ascontiguousarray(one.completed_mask.cpu().numpy(), np.float32) for one in (first, second)
+    )
     if not mask_a.any() or not mask_b.any():
         return ImageChange(0.0, 0.0)
     grey_a, grey_b = (_grey(one) for one in (first, second))
@@ -372,7 +377,13 @@ def image_change(first: Observation, second: Observation) -> ImageChange:
         return np.asarray(cv2.warpAffine(image, similarity, size, flags=flags), np.float32)
 
     mask_b, grey_b = warped(mask_b), warped(grey_b)
-    outline = 1 - float(np.minimum(mask_a, mask_b).sum() / np.maximum(mask_a, mask_b).sum())
+    covered_a, covered_b = (
+        np.zeros(mask_a.shape, np.float32) if one.occluder is None else one.occluder.cpu().numpy()
+        for one in (first, second)
+    )
+    hidden = (covered_a > 0.5) | (warped(np.ascontiguousarray(covered_b)) > 0.5)
+    mask_a, mask_b = (np.where(hidden, np.float32(0), mask) for mask in (mask_a, mask_b))
+    outline = 1 - float(np.minimum(mask_a, mask_b).sum() / max(np.maximum(mask_a, mask_b).sum(), 1e-6))
     both = ((mask_a > _INSIDE) & (mask_b > _INSIDE)).astype(np.uint8)
     inside = cv2.erode(both, np.ones((_MARGIN, _MARGIN), np.uint8)) > 0
     shading = float(np.abs(grey_a - grey_b)[inside].mean()) if inside.any() else 0.0

@@ -17,17 +17,24 @@ from tracking3d.estimation.online.mapping.focal_length import (
 )
 from tracking3d.estimation.online.mapping.keyframe_insertion import draw_keyframes, refine_local_map
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape, surface_places, tracks_of, window_of
+from tracking3d.estimation.online.mapping.photometric_adjustment import fit_jointly
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, render_cost
+from tracking3d.estimation.online.optimization.shape_basis import ShapeBasis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
+from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_from_arrays
 from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
 from tracking3d.points.robust_bundle import intersect
 
 _PASSES = 3
+_VIEWS_WITHOUT_POINTS, _EVALUATIONS = (
+    16,
+    12,
+)  # of a map without points (chosen; 15 evaluations more gain nothing)
 _FOCAL_LENGTH_PENALTY = 0.01
 """Cost by which twice or half the focal length must explain the keyframes better than the current one."""
 
@@ -53,6 +60,28 @@ def refine_globally(object_map: ObjectMap, camera: Camera, config: OnlineConfig)
             tried.append((cost + _FOCAL_LENGTH_PENALTY * lens_change(solved.fy / camera.fy), better, solved))
     _, object_map, camera = min(tried, key=lambda one: one[0])
     return object_map, camera
+
+
+def refit_without_points(object_map: ObjectMap, weights: FitWeights) -> ObjectMap:
+    """A map without points fitted to keyframes from all of the video, its surface begun as it is or as the prototype.
+
+    Local mapping fits the last keyframes, and a surface keeps what poses that were wrong have made of it.
+
+    Args:
+        object_map: The map; at most `_VIEWS_WITHOUT_POINTS` of its keyframes stay.
+        weights: The weights of the shape's terms.
+    """
+    if len(object_map.keyframes) < 2:
+        return object_map
+    count = min(_VIEWS_WITHOUT_POINTS, len(object_map.keyframes))
+    places = np.linspace(0, len(object_map.keyframes) - 1, count).round().astype(int)
+    spread = replace(object_map, keyframes=tuple(object_map.keyframes[place] for place in places))
+    modes = ShapeBasis.of(object_map.shape)
+    starts = [replace(spread, vertices=vertices) for vertices in (spread.vertices, object_map.shape.rest)]
+    fits = [fit_jointly(start, modes, weights, _EVALUATIONS) for start in starts]
+    fitted = min(fits, key=lambda one: one[1])[0]
+    vertices = flatten(fitted.vertices) if fitted.shape.flat else fitted.vertices
+    return replace(fitted, vertices=vertices).with_textures()
 
 
 def keyframe_cost(object_map: ObjectMap) -> float:
