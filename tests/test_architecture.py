@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14350,  # kernels of the joint fit; carried masks; live restarts; two kinds of keypoints; merged photos
+    "estimation": 14350,  # kernels of the joint fit; carried masks; live restarts; photos merged
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
