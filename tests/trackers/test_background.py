@@ -127,11 +127,28 @@ def test_what_comes_to_stay_becomes_background() -> None:
     assert kept.change(with_visitor(50), WINDOW).max() < -0.4
 
 
+def camera_motion(right: int, down: int) -> tuple[np.ndarray, Window, Window, tuple[np.ndarray, np.ndarray]]:
+    """What ``move`` is told of a camera that moves by so many pixels."""
+    shift = np.array([[1, 0, -right], [0, 1, -down]], float)
+    present = cv2.warpAffine(picture(), shift, SHAPE[::-1], borderMode=cv2.BORDER_REPLICATE)
+    present_to_last = np.array([[1, 0, right], [0, 1, down], [0, 0, 1]], float)
+    return present_to_last, WINDOW, WINDOW, (picture(), present)
+
+
+def test_what_moves_before_a_camera_that_stands_still_is_no_motion_of_the_camera() -> None:
+    kept = memory(picture())
+    told, *windows, _ = camera_motion(3, 0)
+    kept.move(told, *windows, (picture(), with_visitor(50)))
+    assert kept.stands_still
+    kept.move(*camera_motion(3, 0))
+    assert not kept.stands_still
+
+
 def test_a_camera_that_is_not_followed_is_forgotten_unless_it_stood_still() -> None:
     kept = memory(picture())
     kept.lose()
     np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.5)
-    kept.move(np.array([[1, 0, 2], [0, 1, 0], [0, 0, 1]], float), WINDOW, WINDOW)
+    kept.move(*camera_motion(2, 0))
     kept.lose()
     np.testing.assert_array_equal(kept.change(picture(), WINDOW), 0)
 
@@ -142,7 +159,7 @@ def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
     shift = np.array([[1, 0, right], [0, 1, down]], float)
     moved = cv2.warpAffine(picture(), shift, SHAPE[::-1], borderMode=cv2.BORDER_REPLICATE)
     unmoved = kept.change(moved, WINDOW)
-    kept.move(np.array([[1, 0, -right], [0, 1, -down], [0, 0, 1]], float), WINDOW, WINDOW)
+    kept.move(*camera_motion(-right, -down))
     inner = np.s_[12:-12, 12:-12]
     assert kept.change(moved, WINDOW)[inner].max() < -0.4
     assert (unmoved > 0).mean() > 0.1
@@ -150,7 +167,7 @@ def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
 
 def test_of_a_camera_that_moves_only_what_has_not_changed_counts() -> None:
     kept = memory(picture())
-    kept.move(np.array([[1, 0, 3], [0, 1, 0], [0, 0, 1]], float), WINDOW, WINDOW)
+    kept.move(*camera_motion(3, 0))
     assert kept.change(255 - picture(), WINDOW).max() == 0
     moved = cv2.warpAffine(picture(), np.array([[1, 0, -3], [0, 1, 0]], float), SHAPE[::-1])
     assert kept.change(moved, WINDOW)[10:-10, 10:-10].max() < -0.4
@@ -159,7 +176,7 @@ def test_of_a_camera_that_moves_only_what_has_not_changed_counts() -> None:
 def test_a_motion_of_crops_alone_is_none_of_the_camera() -> None:
     kept = memory(picture())
     elsewhere = Window(26, 9, 80, 80)
-    kept.move(np.array([[1, 0, 6], [0, 1, 4], [0, 0, 1]], float), WINDOW, elsewhere)
+    kept.move(np.array([[1, 0, 6], [0, 1, 4], [0, 0, 1]], float), WINDOW, elsewhere, (picture(), picture()))
     np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.5)
 
 

@@ -33,7 +33,7 @@ class Claims:
 @pytest.fixture
 def at_rest(monkeypatch) -> None:
     """The camera is known to stand still: in tiny frames its motion is hard to tell from the object's."""
-    monkeypatch.setattr(BackgroundMemory, "move", lambda self, present_to_last, last, present: None)
+    monkeypatch.setattr(BackgroundMemory, "move", lambda self, *camera_motion: None)
 
 
 def last_mask(frames, truth, claims) -> np.ndarray | None:

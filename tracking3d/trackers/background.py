@@ -47,13 +47,21 @@ class BackgroundMemory:
         self.stands_still = True
         self._latest: tuple[Image, Window, NDArray[np.float32]] | None = None  # what `change` has found
 
-    def move(self, present_to_last: NDArray[np.float64], last: Window, present: Window) -> None:
+    def move(
+        self,
+        present_to_last: NDArray[np.float64],
+        last: Window,
+        present: Window,
+        images: tuple[Image, Image] | None = None,
+    ) -> None:
         """Follow the camera.
 
         Args:
             present_to_last: ``(3, 3)`` homography from the present crop's pixels to the last crop's.
             last: The last crop.
             present: The present crop.
+            images: ``(H, W, 3)`` the last and the present frame; a motion of a camera that has stood still is then
+                believed only if they agree.
         """
         matrix = _crop_to_frame(last) @ present_to_last
         matrix = matrix @ np.linalg.inv(_crop_to_frame(present))
@@ -61,12 +69,32 @@ class BackgroundMemory:
         corners = np.array([sides], np.float64)
         if np.abs(cv2.perspectiveTransform(corners, matrix) - corners).max() < _STILL:
             return
+        if self.stands_still and images is not None and self._is_nearer_at_rest(matrix, *images):
+            return
         self.stands_still = False
         height, width = self._frames.shape
         self._mean, self._variance, self._frames, self._proven = (
             cv2.warpPerspective(one, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
             for one in (self._mean, self._variance, self._frames, self._proven)
         )
+
+    def _is_nearer_at_rest(self, matrix: NDArray[np.float64], last: Image, present: Image) -> bool:
+        """Whether the known background of the last frame is nearer to the present one's as it lies than moved.
+
+        What fills most of the crop, as an object that comes in, may be taken for the motion of the camera.
+        """
+        known = (self._proven > 0.5) & (self._frames >= 0.9)
+        if not known.any():
+            return False
+        before, now = (
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (last, present)
+        )
+        inverse = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        moved = cv2.warpPerspective(
+            before, matrix, now.shape[::-1], flags=inverse, borderMode=cv2.BORDER_REPLICATE
+        )
+        at_rest, in_motion = (np.median(np.abs(one - now)[known]) for one in (before, moved))
+        return bool(at_rest <= in_motion)
 
     def lose(self) -> None:
         """The camera is not followed in this frame; all is forgotten but of one that has stood still so far."""

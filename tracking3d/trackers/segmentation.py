@@ -199,6 +199,8 @@ class ColourSegmentation:
             evidence += cues.network * said
             if self._background.stands_still:
                 textured = _is_textured(present.grey)
+                if change[moved].mean() < _SURELY:  # nothing but background, be it plain
+                    return _out_of_sight(image)
                 moved &= (cv2.blur(change, _PATCH) > _SURELY) | ~textured
                 area = np.count_nonzero(moved)
                 if area < _LEAST_PART * self._usual_area * present.window.scale**2:
@@ -248,7 +250,9 @@ class ColourSegmentation:
         if motion.background is None:
             self._background.lose()
         else:
-            self._background.move(motion.background, before, present.window)
+            # Without a network what comes before a still background may as well be a hand.
+            images = None if self._network is None else (self._image, image)
+            self._background.move(motion.background, before, present.window, images)
         return self._background.change(image, present.window)
 
     def _weigh(self, present: FrameCrop, moved: NDArray[np.bool_]) -> Cues:
