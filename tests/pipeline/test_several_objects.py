@@ -202,7 +202,8 @@ def test_all_objects_are_refined_put_right_and_drawn_in_one_more_pass_each(sourc
     iterate = ImageSequence.__iter__
     monkeypatch.setattr(ImageSequence, "__iter__", lambda self: opened.append(1) or iterate(self))
     config = settings("solver.final_refine=true")
-    record_objects(source, config, tmp_path / "run", boxes=[LEFT, RIGHT])
+    video = replace(source, rate=30.0)  # photos are looked at together once more
+    record_objects(video, config, tmp_path / "run", boxes=[LEFT, RIGHT])
     assert len(opened) == 4
     for number in (0, 1):
         run = RunReader(tmp_path / "run" / f"object_{number}")

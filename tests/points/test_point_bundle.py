@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from twins import ray_intersection
 
 from tracking3d.points.bundle_adjustment.adjustment import reversal_of
-from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, other_way_round
+from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, solve_reversed
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(-1, 1, (40, 3))
@@ -181,7 +181,7 @@ def test_the_way_round_that_explains_the_measurements_is_found(wrong):
     solved = partial(
         bundle, intrinsics=INTRINSICS, measured=measured, deviation=np.full((9, 40), 0.1), held=0.3
     )
-    other = other_way_round(points, begun, solved, solved(points, T_cam_obj=begun))
+    other = solve_reversed(points, begun, solved, solved(points, T_cam_obj=begun))
     assert other.is_better == wrong
     assert other.is_hopeless != wrong
     if not wrong:

@@ -9,6 +9,7 @@ from moving_shape import iou
 
 from tracking3d.geometry.camera import Window
 from tracking3d.scene.view import FrameCrop, crop_window
+from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.segmentation import ColourSegmentation, fill_own_holes
 
 SIZE = 120
@@ -84,7 +85,7 @@ class Network:
 def test_a_side_that_turns_into_view_at_once_is_taken_if_the_network_is_sure(
     odds: float, taken: bool
 ) -> None:
-    """A mask that grows by more than a third is refused otherwise."""
+    """A mask that grows by more than a third is refused otherwise, if the background is not known."""
     noise = np.random.default_rng(0).normal(0, 3, (SIZE, SIZE, 3))
     images, masks = [], []
     for right in (60, 90):
@@ -93,7 +94,8 @@ def test_a_side_that_turns_into_view_at_once_is_taken_if_the_network_is_sure(
         image = np.where(mask[..., None], WHITE, WOOD) + noise
         images.append(image.clip(0, 255).astype(np.uint8))
         masks.append(mask)
-    segmentation = ColourSegmentation(images[0], (30, 40, 30, 40), masks[0], network=Network(masks[1], odds))
+    network, cues = Network(masks[1], odds), Cues(background=0.0)
+    segmentation = ColourSegmentation(images[0], (30, 40, 30, 40), masks[0], cues=cues, network=network)
     found = segmentation.step(images[1]).binary
     assert found is not None
     assert iou(found, masks[1 if taken else 0]) > 0.85

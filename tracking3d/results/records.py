@@ -157,6 +157,8 @@ class FrameRecord:
             return _LINE.validate_json(line, strict=True)
         except ValidationError as error:
             fault = error.errors(include_url=False)[0]
+            if "surrogate" in fault["msg"]:  # of a path that is not UTF-8; pydantic reads no such JSON
+                return _LINE.validate_python(json.loads(line))
             name = ".".join(map(str, fault["loc"]))
             if not name:
                 raise ValueError(f"not a frame record: {fault['msg']}") from error

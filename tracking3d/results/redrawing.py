@@ -30,7 +30,10 @@ def redraw_contact_sheet(run: RunReader) -> None:
     """
     records, size, path = run.frames, OverlaySize.of(run.camera), run.folder / layout.CONTACT_SHEET
     positions, thumbnails = crop_positions(len(records)), Thumbnails()
-    earlier = read_image(path) if path.is_file() else None
+    try:
+        earlier = read_image(path) if path.is_file() else None
+    except InputError:  # it is damaged
+        earlier = None
     images = overlay_frames(run, positions) if earlier is None else [earlier] * len(positions)
     for position, image in zip(positions, images, strict=False):
         record = records[position]
