@@ -26,6 +26,7 @@ from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import clear_refinement
 from tracking3d.results.run_reader import RunReader
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.trackers.segment.network import ObjectNetwork
 from tracking3d.video import open_source
 from tracking3d.video.source import FrameSource
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
@@ -154,7 +155,7 @@ def photo_masks(folder, masks, given=()):
     return lost_frames.PhotoMasks(source, before), list(source)
 
 
-def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos):
+def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos, monkeypatch):
     folder, _ = photos
     masks = list(turntable().masks.copy())
     masks[3][:, 160:] = False  # the mask tracker has lost one side,
@@ -164,6 +165,11 @@ def test_photos_are_segmented_in_one_box_where_the_camera_stands_still(photos):
     for index in (3, 4):
         assert mask_iou_or_none(own.of(frames[index]).found, turntable().masks[index]) > 0.9
     assert np.array_equal(own.of(frames[5]).found, masks[5])  # the user knows better
+    again = own.of(frames[3])
+    monkeypatch.setattr(ObjectNetwork, "segment_box", lambda *_: pytest.fail("it is segmented once"))
+    assert np.array_equal(own.of(frames[3]).found, again.found)
+    assert np.array_equal(own.of(frames[3]).occluder, again.occluder)
+    monkeypatch.undo()
     own, frames = photo_masks(folder, list(turntable().masks))  # nothing was lost, and masks stay as they are
     assert own.box is None and np.array_equal(own.of(frames[3]).found, turntable().masks[3])
 

@@ -28,6 +28,7 @@ from tracking3d.frames import TRACKED_CONFIDENCE, Box, Frame, MaskEstimate
 from tracking3d.pipeline.frame_reading import SavedMasks, read_again, read_timed
 from tracking3d.pipeline.session import Session
 from tracking3d.results.description import StartOfModel
+from tracking3d.results.files import pack, unpack
 from tracking3d.results.records import mask_iou_or_none
 from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.trackers.crops import box_of
@@ -186,6 +187,7 @@ class PhotoMasks:
         boxes = np.array([box for mask in found if mask is not None and (box := box_of(mask)) is not None])
         self.box: Box | None = None
         self._masks = masks
+        self._own: dict[int, tuple[bytes, bytes]] = {}  # masks and what is in front of the object, as bits
         if len(boxes):
             (left, top), (right, bottom) = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
             around = float(left), float(top), float(right - left), float(bottom - top)
@@ -211,9 +213,12 @@ class PhotoMasks:
         before = self._masks.of(frame)
         if self.box is None or self._masks.estimates.is_given(frame.index):
             return before
-        likely, hidden = self._network.segment_box(frame.image, self.box)
-        mask = mask_with_network(frame.image, self.box, likely)
-        return replace(before, mask=mask, occluder=(hidden > 0.5) & (mask < 0.5))
+        if frame.index not in self._own:
+            likely, hidden = self._network.segment_box(frame.image, self.box)
+            found = mask_with_network(frame.image, self.box, likely) >= 0.5
+            self._own[frame.index] = pack(found), pack((hidden > 0.5) & ~found)
+        mask, occluder = (unpack(bits, frame.image.shape[:2]) for bits in self._own[frame.index])
+        return replace(before, mask=mask.astype(np.float32), occluder=occluder)
 
 
 def _stands_still(source: FrameSource, around: Box) -> bool:

@@ -180,10 +180,11 @@ def _read_version(path: Path, *version: int) -> PackedMask | None:
         return None
     occluder = levels == OCCLUDER
     height, width = levels.shape
-    return PackedMask((height, width), _pack(levels >= 128), _pack(occluder) if occluder.any() else None)
+    return PackedMask((height, width), pack(levels >= 128), pack(occluder) if occluder.any() else None)
 
 
-def _pack(mask: NDArray[np.bool_]) -> bytes:
+def pack(mask: NDArray[np.bool_]) -> bytes:
+    """``(H, W)`` a mask as bits, see `unpack`."""
     return zlib.compress(np.packbits(mask).tobytes(), 1)
 
 

@@ -68,9 +68,7 @@ _SHARED_POINTS = 5  # known points in a photo from which it can be added
 _LEAST_POINTS, _LEAST_SHARE = 10, 0.5
 # Points that two photos share at least, and the share that fits if they agree
 _LINK_POINTS, _LINK_SHARE = 8, 0.65
-_COMMON_OF_PIECES = (
-    3  # points that two structures know in the photo that they share, to tell their sizes (chosen)
-)
+_COMMON_OF_PIECES = 3  # points that two structures know in the photo they share, to tell their sizes (chosen)
 _CLEAR_SHARE = 0.8  # share of the observations from which no other pose of a photo is tried (chosen)
 _ENOUGH_JOINED = 0.9  # share of the photos from which no other start is tried (chosen)
 _ROUNDS = 3
