@@ -30,8 +30,6 @@ class Files(Silent, SimpleHTTPRequestHandler):
 
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch) -> None:
-    monkeypatch.setattr(opening, "OPENING", 0.5)
-    monkeypatch.setattr(opening, "READING", 0.5)
     monkeypatch.setattr(opening, "PAUSE", 0.01)
 
 
@@ -144,7 +142,9 @@ def test_a_stream_gives_no_more_than_was_selected(tmp_path, serve):
 
 
 @pytest.mark.parametrize("scheme", ["http", "rtsp"])
-def test_a_server_that_says_nothing_is_given_up(scheme):
+def test_a_server_that_says_nothing_is_given_up(scheme, monkeypatch):
+    monkeypatch.setattr(opening, "OPENING", 0.5)
+    monkeypatch.setattr(opening, "READING", 0.5)
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
