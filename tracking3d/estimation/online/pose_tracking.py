@@ -17,14 +17,14 @@ from tracking3d.estimation.online.mapping.local_mapping import (
     project_points,
     to_window,
 )
-from tracking3d.estimation.online.optimization.pnp import pose_from_points
+from tracking3d.estimation.online.optimization.pnp import pose_from_points, pose_of_tracks
 from tracking3d.estimation.online.optimization.pose_refinement import refine_pose, refine_poses, render_cost
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.confidence import PoseCandidate, PoseEvidence
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, extrapolate, pose_from_arrays, rotation_angle
+from tracking3d.geometry.pose import Pose, extrapolate, pose_arrays, pose_from_arrays, rotation_angle
 from tracking3d.points.landmark_adjustment import resect
 from tracking3d.rendering import MatchedPoints, Surface
 
@@ -51,15 +51,16 @@ def fit_pose(
     starts: dict[str, Pose],
     points: FollowedPoints,
     weights: PoseWeights,
+    iterations: tuple[int, ...] = (4, 5),
 ) -> tuple[str, PoseFit]:
-    """The best initial pose, and the pose refined from it."""
+    """The best initial pose, and the pose refined from it; for the iterations see `refine_poses`."""
     weights = replace(weights, outline=weights.outline * view.mask_weight)
     matched = _matched_points(object_map, surface, view, points)
     name = next(iter(starts))
     if len(starts) > 1:
         fits = refine_poses(surface, view.observation, list(starts.values()), matched, weights, (0,))
         name, _ = min(zip(starts, fits, strict=True), key=lambda one: one[1].cost)
-    return name, refine_pose(surface, view.observation, starts[name], matched, weights)
+    return name, refine_pose(surface, view.observation, starts[name], matched, weights, iterations)
 
 
 def pose_of_points(
@@ -75,6 +76,22 @@ def pose_of_points(
     if found is None or found.count < _MIN_INLIERS:
         return None
     return pose_from_arrays(found.R, found.t, object_map.vertices), points.only(found.inliers)
+
+
+def pose_near(object_map: ObjectMap, camera: Camera, view: Keyframe, start: Pose) -> Pose | None:
+    """The pose of least reprojection error near an initial one; None without landmarks enough for it."""
+    points = view.points.only(_is_mature(object_map, view.points))
+    if len(points) < ENOUGH_MATURE:
+        return None
+    position, pixel = object_map.landmarks[points.landmark], points.pixel.astype(np.float64)
+    found = pose_of_tracks(position, pixel, None, camera.K, *pose_arrays(start), scale=pixel_scale(view))
+    return pose_from_arrays(found.R, found.t, object_map.vertices)
+
+
+def _is_mature(object_map: ObjectMap, points: FollowedPoints) -> NDArray[np.bool_]:
+    """``(N,)`` whether points are landmarks on the object that at least two keyframes have seen."""
+    seen = np.isfinite(object_map.landmarks[points.landmark]).all(1) & ~object_map.candidate[points.landmark]
+    return np.asarray(seen & (object_map.sightings[points.landmark] >= 2))
 
 
 def find_inliers(
@@ -101,13 +118,8 @@ def pose_evidence(
     object_map: ObjectMap, camera: Camera, pose: Pose, agree: FollowedPoints, view: Keyframe
 ) -> PoseEvidence:
     """The evidence for a pose apart from its losses; ``agree`` are its inliers."""
-    names = view.points.landmark
-    told = (
-        np.isfinite(object_map.landmarks[names]).all(1)
-        & (object_map.sightings[names] >= 2)
-        & ~object_map.candidate[names]
-    )
-    gap = project_points(object_map.landmarks[names[told]], pose, camera) - view.points.pixel[told]
+    told = view.points.only(_is_mature(object_map, view.points))
+    gap = project_points(object_map.landmarks[told.landmark], pose, camera) - told.pixel
     stray = np.linalg.norm(gap, axis=1) > _MAX_REPROJECTION_ERROR * pixel_scale(view)
     strays = float(stray.mean()) if len(stray) else 0.0
     return PoseEvidence(

@@ -11,13 +11,14 @@ from tracking3d.estimation.estimate import RELOCALIZED
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
-from tracking3d.estimation.online.optimization.types import PoseWeights
+from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.pose_tracking import (
     find_inliers,
     fit_pose,
     is_consistent_with_motion,
     pixel_scale,
     pose_evidence,
+    pose_near,
     pose_of_points,
     pose_predictions,
     predict_points,
@@ -29,7 +30,12 @@ from tracking3d.estimation.online.relocalization import (
     relocalize_in_frame,
     should_retry,
 )
-from tracking3d.estimation.online.state.confidence import PoseCandidate, assess_pose, needs_relocalization
+from tracking3d.estimation.online.state.confidence import (
+    PoseCandidate,
+    assess_pose,
+    fits_outline,
+    needs_relocalization,
+)
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.frames import Frame
@@ -37,6 +43,10 @@ from tracking3d.geometry.pose import Pose
 
 _MOST_ELSEWHERE = 60
 """Inliers from which on the whole frame is not searched: it would have to yield more (34 to 50 on cube_in_hand)."""
+BY_POINTS = "points"
+"""The name of the pose that the followed points alone have."""
+_FEW_STRAYS, _CLOSE = 0.3, 0.5
+"""Outlier ratio and mean loss of points below which they agree so well that nothing else is tried (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +87,12 @@ class Tracker:
         object stays lost, frames with a mask are searched as a whole at intervals.
         """
         object_map, camera = state.object_map, state.camera
+        if not again and (settled := self._by_points(state, view, starts)) is not None:
+            return settled
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
         if points is not None:
-            starts = {**starts, "points": points[0]}
+            starts = {**starts, BY_POINTS: points[0]}
         won, fit = fit_pose(object_map, state.surface, view, starts, view.points, self.weights)
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
@@ -110,12 +122,32 @@ class Tracker:
             origin: What the pose was found by.
             guessed: Whether it is a guess, see `assess_pose`.
         """
-        object_map, camera = state.object_map, state.camera
-        _, fit = fit_pose(object_map, state.surface, view, {origin: view.pose}, view.points, self.weights)
-        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
-        support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        assessment = assess_pose(fit, state.baseline, support, guessed=guessed)
-        return PoseCandidate(view, fit, origin, kept, support, assessment)
+        _, fit = fit_pose(
+            state.object_map, state.surface, view, {origin: view.pose}, view.points, self.weights
+        )
+        return _assessed(state, view, origin, fit, guessed)
+
+    def _by_points(self, state: Mapped, view: Keyframe, starts: dict[str, Pose]) -> PoseCandidate | None:
+        """The pose by the followed points alone; None if they are few, or pixels and outline contradict it.
+
+        Pixels and outline are compared once, at that pose: what a pose that is fitted to them takes over is what
+        surface, texture and mask are wrong by. Nothing more is searched for where many points agree within the outline,
+        whatever the colours do, as under another light.
+        """
+        object_map, usual = state.object_map, state.baseline
+        start = next(iter(starts.values()))
+        pose = None if state.lost else pose_near(object_map, state.camera, view, start)
+        if pose is None or object_map.free_axis is not None:
+            return None
+        name, fit = fit_pose(
+            object_map, state.surface, view, {BY_POINTS: pose}, view.points, self.weights, (0,)
+        )
+        found = _assessed(state, view, name, fit)
+        support = found.evidence
+        agree = support.inliers >= _MOST_ELSEWHERE and support.outlier_ratio < _FEW_STRAYS
+        if agree and fit.points < _CLOSE and fits_outline(fit, usual) and not found.lost:
+            return found
+        return None if found.doubtful or needs_relocalization(fit, usual, support) else found
 
     def _elsewhere(
         self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
@@ -130,3 +162,12 @@ class Tracker:
         view = view_frame(self.observer, state, frame, None if elsewhere else mask, pose, points)
         found = self.attempt(state, view, RELOCALIZED, guessed=True)
         return None if found.lost else found
+
+
+def _assessed(state: Mapped, view: Keyframe, name: str, fit: PoseFit, guessed: bool = False) -> PoseCandidate:
+    """The candidate that a fit is, with its inliers and its assessment."""
+    kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
+    support = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
+    return PoseCandidate(
+        view, fit, name, kept, support, assess_pose(fit, state.baseline, support, guessed=guessed)
+    )
