@@ -402,7 +402,9 @@ STILL = np.deg2rad(0.05)
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Array, float]:
+def resect(
+    scene: LandmarkScene, view: Drawn, known: Sequence[int], turns: int = TURNS
+) -> tuple[Array, float]:
     """The pose ``(4, 4)`` at which a view shows what other views show, and how much of that it shows there.
 
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
@@ -411,9 +413,10 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Arr
         scene: Surface and views, refined; see `tracking3d.points.landmark_adjustment.refine_scene`.
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
+        turns: How often it is drawn and adjusted, at most.
     """
     share, others = 0.0, [scene.views[index] for index in known]
-    for turn in range(TURNS):
+    for turn in range(turns):
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
             _carry_tracks(scene, warps, source, index)
@@ -434,7 +437,7 @@ def resect(scene: LandmarkScene, view: Drawn, known: Sequence[int]) -> tuple[Arr
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
         T_cam_obj = placed.T_cam_obj[0]
         turned = T_cam_obj[:3, :3] @ view.T_cam_obj[:3, :3].T
-        if turn + 1 == TURNS or Rotation.from_matrix(turned).magnitude() < STILL:
+        if turn + 1 == turns or Rotation.from_matrix(turned).magnitude() < STILL:
             return T_cam_obj, share
         view = redraw_surface(view, scene.vertices, scene.faces, T_cam_obj)
     return view.T_cam_obj, share

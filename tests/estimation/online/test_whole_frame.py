@@ -67,10 +67,10 @@ def test_a_doubtful_pose_with_more_points_than_a_search_finds_is_not_searched_fo
     view = replace(state.object_map.keyframes[-1], pose=last)
     asked = []
     monkeypatch.setattr(tracker, "_MOST_ELSEWHERE", most)
-    monkeypatch.setattr(tracker, "assess_pose", lambda *_: Assessment(Status.UNCERTAIN, "", 0.1))
+    monkeypatch.setattr(tracker, "assess_pose", lambda *_, **__: Assessment(Status.UNCERTAIN, "", 0.1))
     monkeypatch.setattr(tracker.Tracker, "_elsewhere", lambda *_: asked.append(1))
     shown = frame(view.index)
-    solver().tracker.find(state, view, replace(shown, index=index + 1), grey(shown.image), {"last": last})
+    solver().tracker.find(state, view, replace(shown, index=index + 1), grey(shown.image))
     assert bool(asked) == searched
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.features.klt import FollowedPoints, has_texture
+from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey, has_texture
 from tracking3d.estimation.online.mapping.keyframe_insertion import draw_keyframe, draw_keyframes
 from tracking3d.estimation.online.mapping.local_mapping import (
     is_well_inside,
@@ -23,6 +23,7 @@ from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.state.confidence import PoseCandidate, PoseEvidence
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
+from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, pose_arrays, pose_from_arrays, rotation_angle
 from tracking3d.points.landmark_adjustment import resect
@@ -78,13 +79,13 @@ def pose_of_points(
     return pose_from_arrays(found.R, found.t, object_map.vertices), points.only(found.inliers)
 
 
-def pose_near(object_map: ObjectMap, camera: Camera, view: Keyframe, start: Pose) -> Pose | None:
-    """The pose of least reprojection error near an initial one; None without landmarks enough for it."""
+def pose_near(object_map: ObjectMap, camera: Camera, view: Keyframe) -> Pose | None:
+    """The pose of least reprojection error near the one that a view has; None without landmarks enough for it."""
     points = view.points.only(_is_mature(object_map, view.points))
     if len(points) < ENOUGH_MATURE:
         return None
     position, pixel = object_map.landmarks[points.landmark], points.pixel.astype(np.float64)
-    found = pose_of_tracks(position, pixel, None, camera.K, *pose_arrays(start), scale=pixel_scale(view))
+    found = pose_of_tracks(position, pixel, None, camera.K, *pose_arrays(view.pose), scale=pixel_scale(view))
     return pose_from_arrays(found.R, found.t, object_map.vertices)
 
 
@@ -188,7 +189,7 @@ def resect_pose(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pos
     positions = [place for place, other in enumerate(object_map.keyframes) if other.index in near]
     scene = draw_keyframes(object_map, camera, positions)
     known = [position for position in positions if scene.views[position] is not None]
-    T, share = resect(scene, drawn, known)
+    T, share = resect(scene, drawn, known, turns=1)
     begun = sum(len(scene.seeds_of(position)[2]) for position in known)
     if share < _MIN_SHARE or share * begun < _MIN_AGREEING:
         return pose
@@ -230,13 +231,18 @@ def pose_predictions(state: Mapped, index: int, mask: NDArray[np.bool_] | None) 
     return {"velocity": extrapolate(before, last, min(steps, 3.0)), "last": last}
 
 
-def predict_points(state: Mapped, pose: Pose) -> NDArray[np.float32] | None:
-    """``(N, 2)`` predicted pixels of the tracked points at a pose; None if there are none."""
-    if not len(state.tracked_points):
-        return None
-    position = state.object_map.landmarks[state.tracked_points.landmark]
-    there, here = (project_points(position, one, state.camera) for one in (pose, state.last_pose[0]))
-    return np.asarray(state.tracked_points.pixel + np.nan_to_num(there - here), dtype=np.float32)
+def follow_points(state: Mapped, frame: Frame) -> tuple[Pose, FollowedPoints]:
+    """The likeliest pose in the next frame, and the tracked points, searched for where they would be then."""
+    if frame.index not in state.followed:
+        likeliest = next(iter(pose_predictions(state, frame.index, None).values()))
+        points, last, guess = state.tracked_points, state.last_pose[0], None
+        if len(points):
+            position = state.object_map.landmarks[points.landmark]
+            there, here = (project_points(position, pose, state.camera) for pose in (likeliest, last))
+            guess = np.asarray(points.pixel + np.nan_to_num(there - here), dtype=np.float32)
+        found = follow(state.grey, grey(frame.image), points, guess)
+        state.followed[frame.index] = likeliest, found
+    return state.followed[frame.index]
 
 
 def is_consistent_with_motion(state: Mapped, pose: Pose, index: int) -> bool:

@@ -39,6 +39,7 @@ from tracking3d.estimation.online.pose_tracking import (
     advance,
     extend_trajectory,
     extrapolate_motion,
+    follow_points,
     pose_predictions,
     resect_pose,
 )
@@ -138,8 +139,8 @@ class OnlineSolver:
         may_insert: bool = True,
     ) -> tuple[Mapped, FrameEstimate]:
         """Estimate the frame's pose, and insert the frame into the map if it may and shows something new."""
-        view, starts = self.tracker.predict(state, frame, image, mask)
-        found = self.tracker.find(state, view, frame, image, starts)
+        view = self.tracker.predict(state, frame, mask)
+        found = self.tracker.find(state, view, frame, image)
         usual = not (found.lost or is_high_loss(found.fit, state.baseline, found.view.mask_weight))
         reliable = usual or (not found.lost and found.evidence.is_decisive)
         is_keyframe = may_insert and reliable and needs_keyframe(state.object_map, found, options)
@@ -268,7 +269,7 @@ class OnlineSolver:
         elif object_map.free_axis is not None and state.last_pose[1] == frame.index - 1:
             starts["last"] = state.last_pose[0]  # the causal pose may be of a surface that was another one
         view = view_frame(self.observer, state, frame, binary, causal, followed)
-        found = self.tracker.find(state, view, frame, image, starts, again=True)
+        found = self.tracker.find(state, view, frame, image, starts)
         before = state.last_pose if state.last_pose[1] == frame.index - 1 else None
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
         if found.lost:  # no better pose than the causal one was found
@@ -346,7 +347,9 @@ class OnlineSolver:
     @staticmethod
     def carry_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """The last frame's mask ``(H, W)`` in the next one, moved as the tracked points are."""
-        return carry(mask, state.grey, grey(frame.image), state.tracked_points)
+        if isinstance(state, Initializing):
+            return None
+        return carry(mask, state.tracked_points, follow_points(state, frame)[1])
 
     @staticmethod
     def restart_backwards(

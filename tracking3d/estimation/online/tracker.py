@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import RELOCALIZED
 from tracking3d.estimation.observation import Observer
-from tracking3d.estimation.online.features.klt import follow
 from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 from tracking3d.estimation.online.pose_tracking import (
     find_inliers,
     fit_pose,
+    follow_points,
     is_consistent_with_motion,
     pixel_scale,
     pose_evidence,
     pose_near,
     pose_of_points,
     pose_predictions,
-    predict_points,
 )
 from tracking3d.estimation.online.relocalization import (
     ROTATION_SEARCH,
@@ -56,21 +55,15 @@ class Tracker:
     observer: Observer  # how a frame becomes an observation
     weights: PoseWeights  # of a pose's cost terms
 
-    def predict(
-        self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> tuple[Keyframe, dict[str, Pose]]:
-        """The frame after the state's last one, seen from the likeliest of the predicted poses; and all of these.
+    def predict(self, state: Mapped, frame: Frame, mask: NDArray[np.bool_] | None) -> Keyframe:
+        """The frame after the state's last one, seen from the likeliest of the predicted poses.
 
         Args:
             state: After the frame before.
             frame: The frame.
-            image: ``(H, W)`` grey.
             mask: ``(H, W)`` its initial mask, or None.
         """
-        starts = pose_predictions(state, frame.index, mask)
-        likeliest = next(iter(starts.values()))
-        followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
-        return view_frame(self.observer, state, frame, mask, likeliest, followed), starts
+        return view_frame(self.observer, state, frame, mask, *follow_points(state, frame))
 
     def find(
         self,
@@ -78,17 +71,20 @@ class Tracker:
         view: Keyframe,
         frame: Frame,
         image: NDArray[np.uint8],
-        starts: dict[str, Pose],
-        again: bool = False,
+        starts: dict[str, Pose] | None = None,
     ) -> PoseCandidate:
-        """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful.
+        """The pose near the predicted ones, or near given ones if the frame is looked at again.
 
-        A doubtful frame that is looked at again was searched as a whole before; only a lost one is once more. While the
-        object stays lost, frames with a mask are searched as a whole at intervals.
+        It is relocalized if the losses are unusual, and in the whole frame if doubtful; a frame that is looked at again
+        was, so that only a lost one is once more. While the object stays lost, frames with a mask are searched as a
+        whole at intervals.
         """
         object_map, camera = state.object_map, state.camera
-        if not again and (settled := self._by_points(state, view, starts)) is not None:
+        again = starts is not None
+        if not again and (settled := self._by_points(state, view)) is not None:
             return settled
+        if starts is None:
+            starts = pose_predictions(state, frame.index, view.mask)
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
         if points is not None:
@@ -127,7 +123,7 @@ class Tracker:
         )
         return _assessed(state, view, origin, fit, guessed)
 
-    def _by_points(self, state: Mapped, view: Keyframe, starts: dict[str, Pose]) -> PoseCandidate | None:
+    def _by_points(self, state: Mapped, view: Keyframe) -> PoseCandidate | None:
         """The pose by the followed points alone; None if they are few, or pixels and outline contradict it.
 
         Pixels and outline are compared once, at that pose: what a pose that is fitted to them takes over is what
@@ -135,8 +131,7 @@ class Tracker:
         whatever the colours do, as under another light.
         """
         object_map, usual = state.object_map, state.baseline
-        start = next(iter(starts.values()))
-        pose = None if state.lost else pose_near(object_map, state.camera, view, start)
+        pose = None if state.lost else pose_near(object_map, state.camera, view)
         if pose is None or object_map.free_axis is not None:
             return None
         name, fit = fit_pose(

@@ -100,18 +100,14 @@ def follow(
     return FollowedPoints(points.landmark[kept], there[kept])
 
 
-def carry(
-    mask: NDArray[np.bool_], before: NDArray[np.uint8], now: NDArray[np.uint8], points: FollowedPoints
-) -> NDArray[np.bool_] | None:
+def carry(mask: NDArray[np.bool_], points: FollowedPoints, here: FollowedPoints) -> NDArray[np.bool_] | None:
     """A mask ``(H, W)`` moved by the affine map that most of the points follow; None if too few do.
 
     Args:
         mask: In the earlier frame.
-        before: ``(H, W)`` grey image of that.
-        now: The later one.
         points: In the earlier frame.
+        here: In the later one.
     """
-    here = follow(before, now, points)
     there = points.pixel[np.isin(points.landmark, here.landmark)]
     if len(here) < _LEAST_CARRYING:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -161,9 +161,14 @@ class ObjectMap:
         )
 
     def silhouette(self, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
-        """Hard silhouette ``(H, W)`` in the full frame."""
-        size = (camera.height, camera.width)
-        K = torch.tensor(camera.K, dtype=torch.float32, device=self.vertices.device)
-        screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
-        drawn = nearest_depth(screen[0], depth[0], self.shape.faces, size, self.renderer)
-        return np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's
+        """Hard silhouette ``(H, W)`` in the full frame; not to be written to."""
+        return _silhouette(self, pose, camera)
+
+
+@lru_cache(maxsize=1)  # a frame's pose is asked for three times
+def _silhouette(object_map: ObjectMap, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
+    size, vertices = (camera.height, camera.width), object_map.vertices
+    K = torch.tensor(camera.K, dtype=torch.float32, device=vertices.device)
+    screen, depth = project(vertices, pose.R[None], pose.translation[None], K[None])
+    drawn = nearest_depth(screen[0], depth[0], object_map.shape.faces, size, object_map.renderer)
+    return np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -118,6 +119,11 @@ class Mapped(_AnyState):
     # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is restarted, they are
     # estimated with the new map. Empty if it cannot be restarted.
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+
+    @cached_property
+    def followed(self) -> dict[int, tuple[Pose, FollowedPoints]]:
+        """By index what `pose_tracking.follow_points` found in next frames: one whose mask is carried asks twice."""
+        return {}
 
     @property
     def lost(self) -> bool:
