@@ -14,11 +14,13 @@ from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.optimization.pose_refinement import render_cost
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.pose_tracking import (
+    ENOUGH_MATURE,
     count_inliers,
     extrapolate_motion,
     find_inliers,
     fit_pose,
     pixel_scale,
+    pose_near,
     pose_of_points,
 )
 from tracking3d.estimation.online.relocalization import aligned_keyframes, search_rotations
@@ -122,6 +124,24 @@ def test_the_pose_of_points_is_theirs_whatever_a_few_say(object_map):
     np.testing.assert_allclose(pose.translation, turned(8).translation, atol=0.02)
     assert not np.isin(kept.landmark, np.arange(len(pixel))[::5]).any()
     assert len(kept) > 0.7 * len(pixel)
+
+
+def test_near_a_prediction_the_points_pull_to_their_pose(object_map):
+    true = object_map.keyframes[1].pose
+    pixel = pixels_of(object_map.landmarks, replace(object_map.keyframes[1], pose=true))
+    pixel[::5] += np.float32([20, -9])
+    points = FollowedPoints(np.arange(len(pixel)), pixel)
+    view = replace(object_map.keyframes[1], pose=at(4, 0.03), points=points)
+    mature = points.only(object_map.sightings >= 2)
+    assert len(mature) >= ENOUGH_MATURE
+    pose = pose_near(object_map, CAMERA, view)
+    assert degrees_apart(pose, true) < 0.3
+    np.testing.assert_allclose(pose.translation, true.translation, atol=0.01)
+    few = replace(view, points=FollowedPoints(mature.landmark[:20], mature.pixel[:20]))
+    assert pose_near(object_map, CAMERA, few) is None
+    # Landmarks of which it is not known whether they are on the object do not count.
+    unsure = replace(object_map, candidate=np.ones_like(object_map.candidate))
+    assert pose_near(unsure, CAMERA, view) is None
 
 
 def test_few_points_have_no_pose(object_map):

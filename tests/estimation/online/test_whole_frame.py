@@ -119,3 +119,25 @@ def test_a_frame_with_a_mask_that_was_moved_becomes_no_keyframe(monkeypatch):
     again = Frame(FRAMES, frame(FRAMES - 1).image)
     assert not solver().step(state, again, own)[1].keyframe
     assert solver().step(state, again, replace(own, carried=False))[1].keyframe
+
+
+@pytest.mark.parametrize("contradicted", [False, True])
+def test_a_pose_whose_points_agree_is_not_fitted_to_pixels_unless_they_contradict_it(
+    monkeypatch, contradicted
+):
+    state, _ = whole_run()
+    shown = frame(FRAMES, shown=FRAMES - 1)
+    steps = []
+    fit_pose = tracker.fit_pose
+    monkeypatch.setattr(
+        tracker,
+        "fit_pose",
+        lambda *given: steps.append(sum((4, 5) if len(given) < 7 else given[6])) or fit_pose(*given),
+    )
+    if contradicted:
+        monkeypatch.setattr(tracker, "_MOST_ELSEWHERE", 10**6)
+        monkeypatch.setattr(tracker, "needs_relocalization", lambda *_: True)
+        monkeypatch.setattr(tracker, "relocalize", lambda state, view, image, best, *_: best)
+    _, estimate = solver().step(state, shown, estimate_of(true_mask(FRAMES - 1)))
+    assert steps == ([0, 9] if contradicted else [0])
+    assert estimate.status is Status.TRACKED and mask_iou(estimate.mask, true_mask(FRAMES - 1)) > 0.9

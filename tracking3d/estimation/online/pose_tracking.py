@@ -174,14 +174,7 @@ landmarks of the side before moved poses by 3 to 18 degrees, and were wrong."""
 
 
 def resect_pose(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> Pose:
-    """A frame's pose, corrected by dense landmarks; as it is if too few of them agree.
-
-    Args:
-        object_map: The map.
-        camera: The camera of the full frame.
-        view: The frame.
-        pose: Where the object is about.
-    """
+    """A frame's pose, corrected by dense landmarks; as it is if too few of them agree."""
     drawn = draw_keyframe(object_map, camera, view, pose)
     if drawn is None:
         return pose
@@ -203,13 +196,7 @@ _BRIEF, _NEAR = 5, 30.0
 
 
 def pose_predictions(state: Mapped, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
-    """Predicted poses for frame ``index`` by name, the likeliest first.
-
-    Args:
-        state: The state before the frame.
-        index: The frame's index.
-        mask: ``(H, W)`` its initial mask, or None; it places an object that was lost.
-    """
+    """Predicted poses for frame ``index`` by name, the likeliest first; ``mask`` ``(H, W)`` places a lost object."""
     last, last_index = state.last_pose
     if state.lost and state.trajectory:
         starts = {
@@ -254,14 +241,7 @@ def is_consistent_with_motion(state: Mapped, pose: Pose, index: int) -> bool:
 
 
 def advance(state: Mapped, found: PoseCandidate, pose: Pose, grey: NDArray[np.uint8]) -> Mapped:
-    """The state one frame later, with the counts of lost and doubtful frames updated.
-
-    Args:
-        state: The state before the frame.
-        found: The frame's pose candidate.
-        pose: The pose that is estimated for it.
-        grey: ``(H, W)`` the frame.
-    """
+    """The state after a grey frame ``(H, W)``, with the counts of lost and doubtful frames updated."""
     searched_for = state.lost_frames + 1 if found.view.mask is not None else max(state.lost_frames, 1)
     return replace(
         state,

@@ -189,12 +189,7 @@ class OnlineSolver:
     ) -> tuple[Mapped, FrameEstimate]:
         """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
 
-        Args:
-            state: After the frame, in which the object is lost.
-            estimate: Of the frame.
-            frame: The frame.
-            image: ``(H, W)`` grey.
-            mask: ``(H, W)`` its initial mask.
+        The state is that after the frame, whose ``image`` ``(H, W)`` is grey; ``mask`` ``(H, W)`` is its initial one.
         """
         searched = state.lost and should_retry(state.lost_frames)
         maps = (state.object_map, *(other.object_map for other in state.inactive_maps))
@@ -357,11 +352,7 @@ class OnlineSolver:
     ) -> SolverState:
         """The state that continues from an earlier frame, with everything learnt since.
 
-        Args:
-            state: The state after the last frame.
-            frame: The frame to continue from.
-            number: The index of the last frame; the next one's follows it.
-            T_cam_obj: ``(4, 4)`` the frame's estimate, used if the frame is no keyframe.
+        The next frame's index follows ``number``; the frame's pose ``(4, 4)`` is used if it is no keyframe.
         """
         waiting = state.pending if isinstance(state, Initializing) else ()
         views = [*state.object_map.keyframes, *(view for view, _ in waiting)]

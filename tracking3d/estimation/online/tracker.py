@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import RELOCALIZED
 from tracking3d.estimation.observation import Observer
 from tracking3d.estimation.online.mapping.keyframe_insertion import view_frame
-from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
+from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.pose_tracking import (
     find_inliers,
     fit_pose,
@@ -56,13 +56,7 @@ class Tracker:
     weights: PoseWeights  # of a pose's cost terms
 
     def predict(self, state: Mapped, frame: Frame, mask: NDArray[np.bool_] | None) -> Keyframe:
-        """The frame after the state's last one, seen from the likeliest of the predicted poses.
-
-        Args:
-            state: After the frame before.
-            frame: The frame.
-            mask: ``(H, W)`` its initial mask, or None.
-        """
+        """The frame after the state's last one, with its initial mask ``(H, W)``, seen from the likeliest pose."""
         return view_frame(self.observer, state, frame, mask, *follow_points(state, frame))
 
     def find(
@@ -81,9 +75,9 @@ class Tracker:
         """
         object_map, camera = state.object_map, state.camera
         again = starts is not None
-        if not again and (settled := self._by_points(state, view)) is not None:
-            return settled
         if starts is None:
+            if (settled := self._by_points(state, view)) is not None:
+                return settled
             starts = pose_predictions(state, frame.index, view.mask)
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
         points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
@@ -109,7 +103,9 @@ class Tracker:
             return other if other is not None and other.better_than(best) else best
         return best
 
-    def attempt(self, state: Mapped, view: Keyframe, origin: str, guessed: bool) -> PoseCandidate:
+    def attempt(
+        self, state: Mapped, view: Keyframe, origin: str, guessed: bool, steps: tuple[int, ...] = (4, 5)
+    ) -> PoseCandidate:
         """The candidate from the pose and the points that a view comes with.
 
         Args:
@@ -117,28 +113,26 @@ class Tracker:
             view: The frame seen from that pose.
             origin: What the pose was found by.
             guessed: Whether it is a guess, see `assess_pose`.
+            steps: See `refine_poses`.
         """
-        _, fit = fit_pose(
-            state.object_map, state.surface, view, {origin: view.pose}, view.points, self.weights
-        )
-        return _assessed(state, view, origin, fit, guessed)
+        object_map, camera, start = state.object_map, state.camera, {origin: view.pose}
+        _, fit = fit_pose(object_map, state.surface, view, start, view.points, self.weights, steps)
+        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        assessment = assess_pose(fit, state.baseline, support, guessed=guessed)
+        return PoseCandidate(view, fit, origin, kept, support, assessment)
 
     def _by_points(self, state: Mapped, view: Keyframe) -> PoseCandidate | None:
         """The pose by the followed points alone; None if they are few, or pixels and outline contradict it.
 
-        Pixels and outline are compared once, at that pose: what a pose that is fitted to them takes over is what
-        surface, texture and mask are wrong by. Nothing more is searched for where many points agree within the outline,
-        whatever the colours do, as under another light.
+        Those are compared at that pose and not fitted, for a fit takes over what surface, texture and mask are wrong
+        by. Many points that agree within the outline settle it, whatever the colours do, as under another light.
         """
-        object_map, usual = state.object_map, state.baseline
-        pose = None if state.lost else pose_near(object_map, state.camera, view)
-        if pose is None or object_map.free_axis is not None:
+        pose = None if state.lost else pose_near(state.object_map, state.camera, view)
+        if pose is None or state.object_map.free_axis is not None:
             return None
-        name, fit = fit_pose(
-            object_map, state.surface, view, {BY_POINTS: pose}, view.points, self.weights, (0,)
-        )
-        found = _assessed(state, view, name, fit)
-        support = found.evidence
+        found = self.attempt(state, replace(view, pose=pose), BY_POINTS, guessed=False, steps=(0,))
+        fit, support, usual = found.fit, found.evidence, state.baseline
         agree = support.inliers >= _MOST_ELSEWHERE and support.outlier_ratio < _FEW_STRAYS
         if agree and fit.points < _CLOSE and fits_outline(fit, usual) and not found.lost:
             return found
@@ -157,12 +151,3 @@ class Tracker:
         view = view_frame(self.observer, state, frame, None if elsewhere else mask, pose, points)
         found = self.attempt(state, view, RELOCALIZED, guessed=True)
         return None if found.lost else found
-
-
-def _assessed(state: Mapped, view: Keyframe, name: str, fit: PoseFit, guessed: bool = False) -> PoseCandidate:
-    """The candidate that a fit is, with its inliers and its assessment."""
-    kept = find_inliers(state.object_map, state.camera, fit.pose, view.points, view)
-    support = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
-    return PoseCandidate(
-        view, fit, name, kept, support, assess_pose(fit, state.baseline, support, guessed=guessed)
-    )
