@@ -44,8 +44,9 @@ _MOST_ELSEWHERE = 60
 """Inliers from which on the whole frame is not searched: it would have to yield more (34 to 50 on cube_in_hand)."""
 BY_POINTS = "points"
 """The name of the pose that the followed points alone have."""
-_FEW_STRAYS, _CLOSE = 0.3, 0.5
-"""Outlier ratio and mean loss of points below which they agree so well that nothing else is tried (chosen)."""
+_FEW_STRAYS, _CLOSE, _USUAL_COST = 0.3, 0.15, 1.2
+"""Outlier ratio and mean loss of points below which they agree so well that nothing else is tried, and appearance loss
+over the usual one up to which a pose stands that pixels were not fitted to (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,8 @@ class Tracker:
         agree = support.inliers >= _MOST_ELSEWHERE and support.outlier_ratio < _FEW_STRAYS
         if agree and fit.points < _CLOSE and fits_outline(fit, usual) and not found.lost:
             return found
-        return None if found.doubtful or needs_relocalization(fit, usual, support) else found
+        unlike = fit.appearance > _USUAL_COST * usual.appearance
+        return None if found.doubtful or unlike or needs_relocalization(fit, usual, support) else found
 
     def _elsewhere(
         self, state: Mapped, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
