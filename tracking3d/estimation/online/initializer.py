@@ -240,9 +240,8 @@ class Initializer:
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        is_network = isinstance(observer.detector, NetworkDetector)
-        other: Detector = SIFT if is_network else NetworkDetector(NetworkDetector.Options())
-        detectors = observer.detector, other
+        own = observer.detector
+        detectors = own, NetworkDetector(NetworkDetector.Options()) if own.rotation_invariant else SIFT
         kinds: tuple[list[Photo], ...] = tuple([] for _ in detectors)
         waiting, strengths = list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):

@@ -7,10 +7,8 @@ with the poses it tells where the axis is. No rotation about it changes any view
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -33,7 +31,7 @@ _MIN_VIEWS = 6  # views that show the object whole (chosen)
 _MIN_SYMMETRY = 0.962
 # Brightness, in [0, 1], by which an object's marks may differ from their mirror images in the median view: .053 and
 # less on nine objects without marks (shadow inside a bowl), .059 and more on two with ten strokes (measured). Between
-# photos .036 and less on four vases of rings, .143 and more on five other sets (measured)
+# photos .038 and less on four vases of rings, .147 and more on five other sets (measured)
 _MOST_MARKED = 0.055
 _MOST_QUANTILE = 0.995  # of the pixels
 _MIN_LEAD = 0.005  # IoU by which the axis leads any other that is `_OTHER` degrees away (chosen)
@@ -134,41 +132,20 @@ def as_surface_of_revolution(
 
 
 def look_revolved(views: Sequence[Keyframe]) -> bool:
-    """Whether photos show a surface of revolution, of which turns about its axis cannot be seen.
-
-    Outlines are their own mirror images. Marks need not be, since light comes from a side; but they stay where they are
-    from photo to photo, once the masks are moved onto each other.
-    """
+    """Whether photos, cut out by their masks, show a surface of revolution: outlines mirror themselves, marks stay."""
     seen = [view.observation for view in views if view.observation.has_mask]
     mirrors = [mirror for one in seen if (mirror := _mirror(one)) is not None]
     if len(mirrors) < _MIN_VIEWS or np.quantile([one.best for one in mirrors], 0.1) < _MIN_SYMMETRY:
         return False
-    moved = [_marks_moved(one, other) for one, other in pairwise(seen)]
+    marks, inner = zip(*((_marks(one), _inner(one.mask.cpu().numpy()) > 0) for one in seen), strict=True)
+    moved = [_difference(marks[n], marks[n + 1], inner[n] & inner[n + 1]) for n in range(len(seen) - 1)]
     return bool(np.median(moved) <= _MOST_MARKED)
-
-
-def _marks_moved(one: Observation, other: Observation) -> float:
-    """By how much the marks of two views differ where their masks are moved onto each other; 1 if they are not."""
-    masks = [seen.mask.cpu().numpy() for seen in (one, other)]
-    places = [np.array([moments[part] / moments["m00"] for part in ("m10", "m01")])
-              for moments in map(cv2.moments, masks)]  # fmt: skip
-    scale = math.sqrt(masks[1].sum() / masks[0].sum())
-    onto = np.column_stack([scale * np.eye(2), places[1] - scale * places[0]])
-    size = masks[0].shape[::-1]
-
-    def moved(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(cv2.warpAffine(values, onto, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
-
-    return _difference(
-        _marks(one), moved(_marks(other)), (_inner(masks[0]) > 0) & (moved(_inner(masks[1])) > 0.5), 1.0
-    )
 
 
 def _marks(seen: Observation) -> NDArray[np.float32]:
     """``(H, W)`` brightness without what changes slowly."""
-    return np.asarray(
-        cv2.GaussianBlur(contrast_of(seen.image, seen.mask.shape[0])[0].cpu().numpy(), (0, 0), 1.5)
-    )
+    contrast = contrast_of(seen.image, seen.mask.shape[0])[0].cpu().numpy()
+    return np.asarray(cv2.GaussianBlur(contrast, (0, 0), 1.5))
 
 
 def _inner(mask: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -176,11 +153,9 @@ def _inner(mask: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.erode((mask > 0.9).astype(np.float32), np.ones((9, 9))))
 
 
-def _difference(
-    one: NDArray[np.float32], other: NDArray[np.float32], where: NDArray[np.bool_], otherwise: float
-) -> float:
+def _difference(one: NDArray[np.float32], other: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
     """What two pictures of marks differ by at most, but for few pixels."""
-    return float(np.quantile(np.abs(one - other)[where], _MOST_QUANTILE)) if where.any() else otherwise
+    return float(np.quantile(np.abs(one - other)[where], _MOST_QUANTILE)) if where.any() else 0.0
 
 
 def _look_symmetric(mirrors: Sequence[_Mirror]) -> bool:
@@ -230,7 +205,7 @@ def _mirror(seen: Observation, centre: FloatArray | None = None) -> _Mirror | No
     best, angle = max((symmetry(degrees), degrees) for degrees in angles)
     marks, inside = _marks(seen), _inner(mask)
     both = (inside > 0) & (mirrored(inside, angle) > 0.5)
-    marked = _difference(marks, mirrored(marks, angle), both, 0.0)
+    marked = _difference(marks, mirrored(marks, angle), both)
     return _Mirror(axes, found, best, marked, bool(whole))
 
 
