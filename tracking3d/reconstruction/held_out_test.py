@@ -66,7 +66,6 @@ def score_held_out(
         )  # fmt: skip
         covered, mask = drawn.face_index[0].numpy() >= 0, view.mask
         either = (covered | mask) & view.in_frame
-        either &= mask if view.occluder is None else mask | ~view.occluder
         overlaps.append((covered & mask).sum() / max(either.sum(), 1))
         colours = drawn.image()[0].permute(1, 2, 0).numpy()
         apart = np.abs(colours - view.image / 255.0).mean(2)

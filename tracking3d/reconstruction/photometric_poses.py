@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.levenberg_marquardt import Damping, minimizer
 from tracking3d.reconstruction.meshing import cell_atlas
-from tracking3d.reconstruction.views import complete_mask
 from tracking3d.rendering import (
     BackProjection,
     NormalEquations,
@@ -96,7 +95,7 @@ def _fit_pose(surface: Surface, view: ObjectView) -> NDArray[np.float64]:
         mask.float(),
         torch.from_numpy(view.in_frame),
         mask,
-        torch.from_numpy(-complete_mask(view).signed_distance),
+        torch.from_numpy(-view.signed_distance),
     )
     first = view.T_cam_obj
 

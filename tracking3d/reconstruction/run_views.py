@@ -145,8 +145,7 @@ def collect_views(
 
 def views_of_frame(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ObjectView, ObjectView] | None:
     """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
-    whole = _whole_view(run, frame, record, run.pinhole_mask(frame.index))
-    shape = shape_view(replace(whole, occluder=run.pinhole_occluder(frame.index)))
+    shape = shape_view(_whole_view(run, frame, record, run.pinhole_mask(frame.index)))
     view = texture_view(_whole_view(run, frame, record, run.visible_pinhole_mask(frame.index)))
     return None if shape is None or view is None else (shape, view)
 

@@ -32,7 +32,7 @@ from tracking3d.reconstruction.meshing import (
 from tracking3d.reconstruction.mirror_completion import complete_by_symmetry
 from tracking3d.reconstruction.mirror_symmetry import SymmetryPlane
 from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps
-from tracking3d.reconstruction.views import complete_mask, spread_by_rotation
+from tracking3d.reconstruction.views import spread_by_rotation
 from tracking3d.runtime.concurrency import start_in_thread
 from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.scene.view import ObjectView
@@ -110,8 +110,7 @@ def reconstruct_shape(
         )
     new_faces = np.asarray(mesh.faces, np.int64)
     report_progress("fitting outlines")
-    outlines = [complete_mask(view) for view in references]
-    new_vertices = fit_to_outlines(np.asarray(mesh.vertices), new_faces, outlines)
+    new_vertices = fit_to_outlines(np.asarray(mesh.vertices), new_faces, references)
     old, new = scored(), score(new_vertices, new_faces)
     comparison = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
@@ -132,15 +131,15 @@ def _volume(
     vertices = np.concatenate([points for points, _ in starts])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     truncation = _TRUNCATION * diagonal
-    coarse, whole = Grid.around(vertices, _COARSE, _MARGIN), [complete_mask(view) for view in views]
-    around, _ = carve_hull(coarse.points, whole, 2 * truncation)
+    coarse = Grid.around(vertices, _COARSE, _MARGIN)
+    around, _ = carve_hull(coarse.points, views, 2 * truncation)
     prior = _prior(coarse, around, starts, references, truncation)
     guide = _guide(coarse, around, prior, *starts[0])
     maps = depth_maps(views, references, guide, _REACH * diagonal, _STEPS, wide=wide)
     grid = coarse.around_centres(around > -coarse.spacing, coarse.spacing * _COARSE / _CELLS)
     hull = coarse.resample(around, grid)
     near = np.abs(hull) < _BAND * coarse.spacing
-    hull[near], _ = carve_hull(grid.points[near], whole, 2 * truncation)
+    hull[near], _ = carve_hull(grid.points[near], views, 2 * truncation)
     prior = _prior(grid, hull, starts, references, truncation)
     total, weight = np.zeros_like(hull), np.zeros_like(hull)
     inside = hull > -truncation

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from tracking3d.estimation.observation import convex_hull
 from tracking3d.geometry.camera import Window
 from tracking3d.scene.view import ObjectView
 from tracking3d.trackers.crops import box_of
@@ -35,13 +33,6 @@ def shape_view(frame: ObjectView, side: int = SIDE) -> ObjectView | None:
         return None
     view = frame.at(Window.around(box, _MARGIN, side))
     return view if view.mask.any() else None
-
-
-def complete_mask(view: ObjectView) -> ObjectView:
-    """The view with what of its mask's convex hull is behind an occluder, whose outline is not the object's."""
-    if view.occluder is None:
-        return view
-    return replace(view, mask=view.mask | (convex_hull(view.mask) & view.occluder), occluder=None)
 
 
 def keep_best_views(views: tuple[ObjectView, ...], view: ObjectView, most: int) -> tuple[ObjectView, ...]:

@@ -212,11 +212,6 @@ class RunReader:
         """
         return self.camera.mask_to_pinhole(self.mask(index))
 
-    def pinhole_occluder(self, index: int) -> NDArray[np.bool_] | None:
-        """What is in front of the object ``(H, W)``, as `pinhole_mask`; None if nothing is known to be."""
-        occluder = read_occluder(self.folder, index)
-        return None if occluder is None else self.camera.mask_to_pinhole(occluder)
-
     def visible_mask(self, index: int) -> NDArray[np.bool_]:
         """What is seen of the object in frame ``index``, ``(H, W)``: its mask without what is in front of it.
 
