@@ -236,9 +236,7 @@ class Initializer:
         observer, camera = self.observer, self.observer.camera
         known = [view.strength for view in state.object_map.keyframes if view.strength < np.inf]
         if state.object_map.pointless and known and not has_texture(known):
-            return state, PhotoEstimates(
-                (), _REVOLVED if look_revolved(state.object_map.keyframes) else _PLAIN
-            )
+            return state, PhotoEstimates((), _PLAIN)
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
@@ -264,7 +262,7 @@ class Initializer:
         start = None if plain else start_of_photos(kinds, camera)
         if begun is None or start is None or start.structure is None:
             reason = _PLAIN if start is None else start.reason
-            if look_revolved([view for view, _ in waiting]):
+            if start is not None and look_revolved([view for view, _ in waiting]):
                 reason = f"{len(waiting)} photos, none joined; {_REVOLVED}"
             if isinstance(state, Initializing):
                 state = replace(state, waiting_reason=reason)
