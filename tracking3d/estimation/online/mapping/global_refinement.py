@@ -180,10 +180,16 @@ def _refine_map(
 
 
 def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
-    """The map with a scene's surface and poses, turned so that the pose of the first keyframe stays."""
+    """The map with a scene's surface and poses, where the first keyframe's rotation and the object's centre stay.
+
+    The origin has to stay in the object: another focal length moves the object as it moves its origin.
+    """
     first = scene.views[0]
     assert first is not None
-    T_map_scene = np.linalg.inv(object_map.keyframes[0].pose.matrix().numpy()) @ first.T_cam_obj
+    T_map_scene = np.eye(4)
+    R = object_map.keyframes[0].pose.matrix().numpy()[:3, :3].T @ first.T_cam_obj[:3, :3]
+    T_map_scene[:3, :3] = R
+    T_map_scene[:3, 3] = object_map.vertices.cpu().numpy().mean(0) - R @ scene.vertices.mean(0)
     T_scene_map = np.linalg.inv(T_map_scene)
     keyframes = list[Keyframe]()
     for view, drawn in zip(object_map.keyframes, scene.views, strict=True):
