@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from twins import ray_intersection
 
-from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.geometry.camera import LENS_KNOWN
+from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, solve_reversed
 
 RNG = np.random.default_rng(3)

@@ -144,8 +144,7 @@ def look_revolved(views: Sequence[Keyframe]) -> bool:
 
 def _marks(seen: Observation) -> NDArray[np.float32]:
     """``(H, W)`` brightness without what changes slowly."""
-    contrast = contrast_of(seen.image, seen.mask.shape[0])[0].cpu().numpy()
-    return np.asarray(cv2.GaussianBlur(contrast, (0, 0), 1.5))
+    return np.asarray(cv2.GaussianBlur(contrast_of(seen.image, len(seen.mask))[0].cpu().numpy(), (0, 0), 1.5))
 
 
 def _inner(mask: NDArray[np.float32]) -> NDArray[np.float32]:

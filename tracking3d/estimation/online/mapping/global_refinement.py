@@ -173,23 +173,20 @@ def _refine_map(
     if scene.focal_factor != 1:
         solved = camera.with_solved_focal(scene.focal_factor)
         object_map, camera = map_through_lens(object_map, camera, solved), solved
-    object_map = _triangulate(_take_over(object_map, scene), camera)
+    object_map = _triangulate(_take_over(object_map, scene, camera), camera)
     positions = window_of(len(object_map.keyframes), config.local_window)
     object_map = fit_shape(object_map, positions, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
     return object_map.with_textures(), camera
 
 
-def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
-    """The map with a scene's surface and poses, where the first keyframe's rotation and the object's centre stay.
-
-    The origin has to stay in the object: another focal length moves the object as it moves its origin.
-    """
+def _take_over(object_map: ObjectMap, scene: LandmarkScene, camera: Camera) -> ObjectMap:
+    """The map with a scene's surface and poses, and the first keyframe's pose; if the lens may move, its rotation."""
     first = scene.views[0]
     assert first is not None
-    T_map_scene = np.eye(4)
-    R = object_map.keyframes[0].pose.matrix().numpy()[:3, :3].T @ first.T_cam_obj[:3, :3]
-    T_map_scene[:3, :3] = R
-    T_map_scene[:3, 3] = object_map.vertices.cpu().numpy().mean(0) - R @ scene.vertices.mean(0)
+    T_map_scene = np.linalg.inv(object_map.keyframes[0].pose.matrix().numpy()) @ first.T_cam_obj
+    if camera.assumed:  # the origin stays in the object: another lens moves both alike
+        centre = T_map_scene[:3, :3] @ scene.vertices.mean(0)
+        T_map_scene[:3, 3] = object_map.vertices.cpu().numpy().mean(0) - centre
     T_scene_map = np.linalg.inv(T_map_scene)
     keyframes = list[Keyframe]()
     for view, drawn in zip(object_map.keyframes, scene.views, strict=True):
