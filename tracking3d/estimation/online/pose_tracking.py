@@ -102,12 +102,9 @@ def pose_evidence(
 ) -> PoseEvidence:
     """The evidence for a pose apart from its losses; ``agree`` are its inliers."""
     names = view.points.landmark
-    told = (
-        np.isfinite(object_map.landmarks[names]).all(1)
-        & (object_map.sightings[names] >= 2)
-        & ~object_map.candidate[names]
-    )
-    gap = project_points(object_map.landmarks[names[told]], pose, camera) - view.points.pixel[told]
+    told = view.points.only((object_map.sightings[names] >= 2) & ~object_map.candidate[names])
+    position = object_map.landmarks[told.landmark]
+    gap = (project_points(position, pose, camera) - told.pixel)[np.isfinite(position).all(1)]
     stray = np.linalg.norm(gap, axis=1) > _MAX_REPROJECTION_ERROR * pixel_scale(view)
     strays = float(stray.mean()) if len(stray) else 0.0
     return PoseEvidence(
@@ -161,14 +158,7 @@ landmarks of the side before moved poses by 3 to 18 degrees, and were wrong."""
 
 
 def resect_pose(object_map: ObjectMap, camera: Camera, view: Keyframe, pose: Pose) -> Pose:
-    """A frame's pose, corrected by dense landmarks; as it is if too few of them agree.
-
-    Args:
-        object_map: The map.
-        camera: The camera of the full frame.
-        view: The frame.
-        pose: Where the object is about.
-    """
+    """A frame's pose, corrected by dense landmarks; as it is if too few of them agree."""
     drawn = draw_keyframe(object_map, camera, view, pose)
     if drawn is None:
         return pose
@@ -190,13 +180,7 @@ _BRIEF, _NEAR = 5, 30.0
 
 
 def pose_predictions(state: Mapped, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
-    """Predicted poses for frame ``index`` by name, the likeliest first.
-
-    Args:
-        state: The state before the frame.
-        index: The frame's index.
-        mask: ``(H, W)`` its initial mask, or None; it places an object that was lost.
-    """
+    """Predicted poses for frame ``index`` by name, the likeliest first; ``mask`` ``(H, W)`` places a lost object."""
     last, last_index = state.last_pose
     if state.lost and state.trajectory:
         starts = {
