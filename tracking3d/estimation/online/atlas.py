@@ -311,8 +311,7 @@ def _with_merged_map(
 
 
 _COMPARED_KEYFRAMES = 4  # keyframes of the first map that each of the second is compared with
-# Pixels at an object size of 200 pixels, between both projections of a landmark
-_MAX_REPROJECTION_ERROR = 20.0
+_MAX_REPROJECTION_ERROR = 20.0  # pixels at an object size of 200, between both projections of a landmark
 
 Pairs = NDArray[np.int64]
 """``(N, 2)`` indices of landmarks of the first and second map that are the same point of the object."""

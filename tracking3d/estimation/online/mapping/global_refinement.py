@@ -31,10 +31,7 @@ from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, r
 from tracking3d.points.robust_bundle import intersect
 
 _PASSES = 3
-_VIEWS_WITHOUT_POINTS, _EVALUATIONS = (
-    16,
-    12,
-)  # of a map without points (chosen; 15 evaluations more gain nothing)
+_VIEWS_WITHOUT_POINTS, _EVALUATIONS = 16, 12  # without points (chosen; 15 evaluations more: no gain)
 _FOCAL_LENGTH_PENALTY = 0.01
 """Cost by which twice or half the focal length must explain the keyframes better than the current one."""
 
