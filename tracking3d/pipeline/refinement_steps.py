@@ -30,7 +30,6 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH
 from tracking3d.estimation.segmentation.whole_video import (
-    LARGEST_AGAIN,
     SegmentedMask,
     VideoSegmenter,
     draw_around_masks,
@@ -133,7 +132,7 @@ class Retracking:
         mask = camera.mask_to_pinhole(self._masks.estimates.mask(record))
         image, pose = np.zeros((*mask.shape, 3), np.uint8), self.predict(record)
         view = ObjectView.of_frame(index, image, mask, replace(camera, lens=None), pose, initial=mask)
-        drawn = draw_around_masks(view, *self._surface, LARGEST_AGAIN)
+        drawn = draw_around_masks(view, *self._surface, again=True)
         overlap = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (overlap or 0.0) > record.diagnostics.get("mask_iou", 1.0) - _LOST_OVERLAP
 
@@ -255,8 +254,9 @@ class RefinementSteps:
         assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
         if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
             return True
-        surface = self.look.vertices_of_landmarks, self.look.faces, LARGEST_AGAIN
-        self._drawn = drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
+        surface = self.look.vertices_of_landmarks, self.look.faces
+        view = self._segmentation_input(frame, T_cam_obj)
+        self._drawn = drawn = draw_around_masks(view, *surface, again=True)
         agreement = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (agreement or 0.0) <= self._retracking.least_agreement
 
