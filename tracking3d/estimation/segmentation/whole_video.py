@@ -277,7 +277,7 @@ def _least_iou(scene: Drawn) -> float:
 
 
 def _iou(mask: Mask, other: Mask) -> float:
-    return float(np.count_nonzero(mask & other) / max(np.count_nonzero(mask | other), 1))
+    return float(np.count_nonzero(mask & other) / max(int(np.count_nonzero(mask | other)), 1))
 
 
 _ON, _OFF = 1.0, (3.0, 9.0)
