@@ -35,7 +35,7 @@ from tracking3d.estimation.segmentation.whole_video import (
     draw_around_masks,
 )
 from tracking3d.estimation.solver import LEAST_FRAMES, RefinedStart
-from tracking3d.frames import Frame
+from tracking3d.frames import Frame, mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.frame_reading import SavedMasks
 from tracking3d.pipeline.session import Session
@@ -43,7 +43,7 @@ from tracking3d.reconstruction.confidence import assess_estimate
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, HeldAdjustment
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
-from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import adjusted_record
 from tracking3d.results.run_reader import RunReader

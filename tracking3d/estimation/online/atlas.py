@@ -34,7 +34,7 @@ from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBas
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, Mapped
 from tracking3d.estimation.segmentation import as_lab
-from tracking3d.frames import TRACKED_CONFIDENCE, Frame
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame, mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.geometry.similarity import Similarity
@@ -433,10 +433,7 @@ def needs_second_map(state: Mapped, image: NDArray[np.uint8], mask: NDArray[np.b
 
 def masks_overlap(before: NDArray[np.bool_] | None, mask: NDArray[np.bool_]) -> bool:
     """Whether the masks ``(H, W)`` of two frames overlap enough to show the same object."""
-    if before is None:
-        return False
-    either = int(np.count_nonzero(before | mask))
-    return int(np.count_nonzero(before & mask)) > _MIN_MASK_IOU * either
+    return (mask_iou_or_none(mask, before) or 0.0) > _MIN_MASK_IOU
 
 
 def is_fully_visible(mask: NDArray[np.bool_]) -> bool:

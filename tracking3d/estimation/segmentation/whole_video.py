@@ -30,6 +30,7 @@ from tracking3d.estimation.segmentation.pose_weight import blend_with_initial, p
 from tracking3d.estimation.segmentation.soft_visual_hull import SoftVisualHull
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH, TemporalNeighbours
 from tracking3d.estimation.segmentation.whole_video_weights import WEIGHTS
+from tracking3d.frames import mask_iou_or_none
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.runtime.concurrency import OrderedExecutor
 from tracking3d.scene.surface import Drawn, draw
@@ -177,7 +178,7 @@ class VideoSegmenter:
         for scene in (self._examples[place] for place in places.round().astype(int)):
             motion = np.zeros((2, *scene.mask.shape), np.float32)
             said = PixelEvidence.of(scene, self._consensus.drawn(scene), self._colours, motion)
-            overlaps.append(_iou(scene.mask, self._support(scene, said, 0.0) > 0))
+            overlaps.append(mask_iou_or_none(scene.mask, self._support(scene, said, 0.0) > 0) or 0.0)
         return not overlaps or float(np.quantile(overlaps, 0.25)) > _STAYS
 
     def needs(self, index: int) -> bool:
@@ -247,8 +248,7 @@ class VideoSegmenter:
         support = self._support(scene, said, initial_weight)
         full = paste_window(support, scene.window, np.full(frame.frame_size, -1, np.float32))
         mask = full > 0
-        common, either = (np.count_nonzero(way(mask, frame.mask)) for way in (np.logical_and, np.logical_or))
-        if common < (1 - _MOST_CHANGE) * either:
+        if (mask_iou_or_none(mask, frame.mask) or 0.0) < 1 - _MOST_CHANGE:
             return frame.index, None
         return frame.index, SegmentedMask(frame.index, mask, 0.5 + 0.5 * full)
 
@@ -273,11 +273,7 @@ class VideoSegmenter:
 def _least_iou(scene: Drawn) -> float:
     """The lower IoU of a frame's mask with the silhouette and with the initial mask, where there is one."""
     others = [scene.silhouette, *([scene.initial] if scene.initial.any() else [])]
-    return min(_iou(scene.mask, other) for other in others)
-
-
-def _iou(mask: Mask, other: Mask) -> float:
-    return float(np.count_nonzero(mask & other) / max(int(np.count_nonzero(mask | other)), 1))
+    return min(mask_iou_or_none(scene.mask, other) or 0.0 for other in others)
 
 
 _ON, _OFF = 1.0, (3.0, 9.0)

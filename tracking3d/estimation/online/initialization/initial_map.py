@@ -27,6 +27,7 @@ from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import RADIUS, place_on_mask
+from tracking3d.frames import mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import (
     Pose,
@@ -409,7 +410,7 @@ def _turning_time(views: list[Keyframe]) -> float:
         """Mean 1 - IoU of the outlines with those of the views at the mirrored times."""
         near = np.abs(2 * turn - time[:, None] - time[None]).argmin(1)
         pairs = [(a, b) for a, b in enumerate(near) if 0 <= 2 * turn - time[a] <= time[-1] and a != b]
-        alike = [(outlines[a] & outlines[b]).sum() / (outlines[a] | outlines[b]).sum() for a, b in pairs]
+        alike = [mask_iou_or_none(outlines[a], outlines[b]) or 0.0 for a, b in pairs]
         return 1 - float(np.mean(alike)) if alike else 1.0
 
     return min((float(turn) for turn in time[-1] * np.linspace(0.25, 0.75, 11)), key=difference)
