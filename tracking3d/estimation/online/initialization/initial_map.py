@@ -55,6 +55,8 @@ _LAST_EVALUATIONS = 5  # of the best one
 _VIEWS_AGAIN = 12  # keyframes from which a map is restarted (chosen)
 _CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best other rotation (chosen)
 _SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
+_RIVAL_EVALUATIONS = 12  # of a rotation that a finished map is compared with (as its own fit has)
+_LARGEST_LEAD = 2.0  # (chosen)
 _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
 
@@ -209,6 +211,39 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
     clear = cost < _CLEARLY_BETTER * min([before, *others])
     return _without_points(found) if clear else object_map
+
+
+def lead_over_rivals(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> float:
+    """The logarithm by which fits of other rotations to the keyframes of a map without points cost more than its own.
+
+    The rivals, its reversal and rotations near it, begin with the prototype. The joint cost, with light, tells right
+    rotations of a whole video from wrong ones where that of each frame does not.
+
+    Args:
+        object_map: The map, fitted to its keyframes.
+        camera: The camera of the full frame.
+        weights: The weights of the shape's terms.
+
+    Returns:
+        That of the cheapest rival that turns otherwise, at most `_LARGEST_LEAD`: so, too, if all end as the map turns.
+    """
+    modes, views = ShapeBasis.of(object_map.shape), list(object_map.keyframes)
+    poses = [view.pose for view in views]
+    cost, blank = (
+        fit_jointly(object_map, modes, weights, 0)[1],
+        replace(object_map, vertices=object_map.shape.rest),
+    )
+    others = []
+    for rotations in (reverse_rotations(views, camera), *vary_rotations(views, poses, camera)):
+        start = replace(blank, keyframes=_with_poses(views, rotations))
+        rival, its_cost = fit_jointly(start, modes, weights, _RIVAL_EVALUATIONS)
+        apart = [
+            rotation_angle(one.pose.quaternion, two.quaternion)
+            for one, two in zip(rival.keyframes, poses, strict=True)
+        ]
+        if math.degrees(max(map(float, apart))) > _SAME_ROTATION:
+            others.append(its_cost)
+    return min(math.log(min(others) / cost), _LARGEST_LEAD) if others else _LARGEST_LEAD
 
 
 _Fitted = tuple[float, ObjectMap, str]

@@ -65,6 +65,7 @@ class ObjectMap:
     candidate: NDArray[np.bool_]
     # whether the object has no points that can be tracked: only pixels and outlines constrain it
     pointless: bool = False
+    lead: float = math.nan  # of a finished map without points, see `lead_over_rivals`; NaN of other maps
     renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
     # (8, 2) candidate landmarks in each direction from the object: those that could be tested, and those that
     # move with it
