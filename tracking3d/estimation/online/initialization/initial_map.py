@@ -28,6 +28,7 @@ from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import RADIUS, place_on_mask
 from tracking3d.frames import mask_iou_or_none
+from tracking3d.geometry.alignment import rotation_alignment
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import (
     Pose,
@@ -57,6 +58,7 @@ _CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best oth
 _SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
 _RIVAL_EVALUATIONS = 12  # of a rotation that a finished map is compared with (as its own fit has)
 _LARGEST_LEAD = 2.0  # (chosen)
+_TURNS_OTHERWISE = 15.0  # degrees, mean over the views after alignment (chosen among 10, 15 and 20)
 _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
 
@@ -228,22 +230,17 @@ def lead_over_rivals(object_map: ObjectMap, camera: Camera, weights: FitWeights)
         That of the cheapest rival that turns otherwise, at most `_LARGEST_LEAD`: so, too, if all end as the map turns.
     """
     modes, views = ShapeBasis.of(object_map.shape), list(object_map.keyframes)
-    poses = [view.pose for view in views]
-    cost, blank = (
-        fit_jointly(object_map, modes, weights, 0)[1],
-        replace(object_map, vertices=object_map.shape.rest),
-    )
-    others = []
+    poses, blank = [view.pose for view in views], replace(object_map, vertices=object_map.shape.rest)
+    own, cost = Pose.stack(poses).R.double().numpy(), fit_jointly(object_map, modes, weights, 0)[1]
+    others = [_LARGEST_LEAD]
     for rotations in (reverse_rotations(views, camera), *vary_rotations(views, poses, camera)):
         start = replace(blank, keyframes=_with_poses(views, rotations))
         rival, its_cost = fit_jointly(start, modes, weights, _RIVAL_EVALUATIONS)
-        apart = [
-            rotation_angle(one.pose.quaternion, two.quaternion)
-            for one, two in zip(rival.keyframes, poses, strict=True)
-        ]
-        if math.degrees(max(map(float, apart))) > _SAME_ROTATION:
-            others.append(its_cost)
-    return min(math.log(min(others) / cost), _LARGEST_LEAD) if others else _LARGEST_LEAD
+        R = Pose.stack([view.pose for view in rival.keyframes]).R.double().numpy()
+        apart = R @ rotation_alignment(R, own) @ own.transpose(0, 2, 1)
+        if Rotation.from_matrix(apart).magnitude().mean() > math.radians(_TURNS_OTHERWISE):
+            others.append(math.log(its_cost / cost))
+    return min(others)
 
 
 _Fitted = tuple[float, ObjectMap, str]
