@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14400,  # kernels of the joint fit; carried masks; live restarts; photos merged; masks tried
+    "estimation": 14410,  # kernels of the joint fit; carried masks; live restarts; photos merged; masks tried
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
