@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14350,  # kernels of the joint fit; carried masks; live restarts; photos merged
+    "estimation": 14410,  # kernels of the joint fit; carried masks; live restarts; photos merged; masks tried
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,
@@ -44,7 +44,7 @@ ROOM_LINES = {
     "plugins": 850,  # the group of keypoint detectors
     "points": 3650,  # the fit of one pose in a kernel
     "reconstruction": 3900,  # total variation in a kernel
-    "rendering": 3850,  # depth without faces
+    "rendering": 3800,  # depth without faces
     "results": 6800,
     "runtime": 1200,  # logistic regressions from files
     "scene": 350,

@@ -120,3 +120,10 @@ class MaskEstimate:
 def pixels(size: tuple[int, int]) -> str:
     """A size ``(height, width)`` as sentences have it, width first."""
     return f"{size[1]} x {size[0]}"
+
+
+def mask_iou_or_none(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
+    """Intersection over union of two ``(H, W)`` masks; None if one is absent or both are empty."""
+    if b is None or not (union := np.count_nonzero(a | b)):
+        return None
+    return float(np.count_nonzero(a & b) / union)

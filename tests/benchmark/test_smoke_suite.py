@@ -11,7 +11,8 @@ from tracking3d.cli import app
 from tracking3d_bench.synthesis import suite as suite_module
 
 
-@pytest.mark.parametrize("sequences", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("sequences", [1, 3])
 def test_the_smoke_suite_is_made_tracked_and_scored(tmp_path, monkeypatch, sequences):
     pytest.importorskip("embreex", reason="the extra synth is not installed")
     specs = suite_module.load_suite("smoke")

@@ -21,7 +21,7 @@ def mesh_of(run: Path) -> dict[str, bytes]:
     [
         pytest.param(14, (160, 120), 4, True, id="the shape is new", marks=pytest.mark.slow),
         pytest.param(7, (120, 96), 5, False, id="there are too few frames for a new one"),
-        pytest.param(5, (120, 96), 2, False, id="the object hardly turns"),
+        pytest.param(5, (120, 96), 2, False, id="the object hardly turns", marks=pytest.mark.slow),
     ],
 )
 def test_a_finished_run_gets_the_same_mesh_again(call, tmp_path, frames, size, step, is_new):

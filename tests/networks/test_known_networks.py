@@ -64,7 +64,7 @@ def test_some_network_forbids_commercial_use_and_says_so():
 
 
 UNUSED = {"edgepoint2_m64.onnx", "edgepoint2_t32.onnx"}
-"""Keypoint networks, for which the product has no plug-in: the catalogue would promise what it cannot run."""
+"""Keypoint networks: one is in the plug-in tracking3d-edgepoint2, the other has taught the package's own."""
 
 
 def test_the_catalogue_knows_the_development_files(shared_models: Path):

@@ -157,6 +157,7 @@ def test_a_second_start_is_made_if_a_quarter_is_left_and_adopted_only_if_it_expl
     assert "A start in frame 5 explains" in caplog.text
 
 
+@pytest.mark.slow
 def test_gaps_take_no_more_frames_than_are_left(monkeypatch, tmp_path, video):
     monkeypatch.setattr(Session, "tried", FRAMES - 2)
     monkeypatch.setattr(lost_frames, "find_start", lambda *_: pytest.fail("no frames are left for it"))

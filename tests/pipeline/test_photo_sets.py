@@ -15,13 +15,13 @@ from resumable_runs import Stopped, assert_alike, settings, stop_at
 from tracking3d.estimation.estimate import FREE_ROTATION, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.solver import PhotoEstimates
-from tracking3d.frames import MaskEstimate
+from tracking3d.frames import MaskEstimate, mask_iou_or_none
 from tracking3d.pipeline import lost_frames
 from tracking3d.pipeline.record import record
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import clear_refinement
 from tracking3d.results.run_reader import RunReader

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from twins import ray_intersection
 
+from tracking3d.geometry.camera import LENS_KNOWN
 from tracking3d.points.bundle_adjustment.adjustment import reversal_of
 from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, solve_reversed
 
@@ -134,18 +135,20 @@ def test_noise_is_no_proof_of_another_lens():
     assert found.focal_factor == pytest.approx(1, abs=0.05)
 
 
-def deviation_of_lens(degrees: float, distance: float, seed: int = 5) -> tuple[float, float]:
-    """Error and standard deviation of the logarithm of a focal length that was taken for a fifth too short."""
+def deviation_of_lens(
+    degrees: float, distance: float, seed: int = 5, factor: float = 1.2
+) -> tuple[float, float]:
+    """Error and standard deviation of the logarithm of a focal length that was taken for ``factor`` times too short."""
     T, random = poses(), np.random.default_rng(seed)
     turns = np.deg2rad(np.linspace(0, degrees, 9))[:, None] * np.array([0.0, 1.0, 0.0])
     T[:, :3, :3], T[:, 2, 3] = Rotation.from_rotvec(turns).as_matrix(), distance
     measured = projected(POINTS, T) + random.normal(0, 0.1, (9, 40, 2))
-    T[:, 2, 3] /= 1.2
-    lens, deviation = INTRINSICS / [1.2, 1.2, 1, 1], np.full((9, 40), 0.1)
+    T[:, 2, 3] /= factor
+    lens, deviation = INTRINSICS / [factor, factor, 1, 1], np.full((9, 40), 0.1)
     given = bundle(POINTS, lens, T, measured, deviation, 0.1)
     found = bundle(POINTS, lens, T, measured, deviation, 0.1, begun=given)
     assert given.focal_deviation is None and found.focal_deviation is not None
-    return np.log(found.focal_factor / 1.2), found.focal_deviation
+    return np.log(found.focal_factor / factor), found.focal_deviation
 
 
 def test_a_lens_is_certain_after_a_large_turn_seen_from_near_and_uncertain_after_a_small_one_from_afar():
@@ -153,6 +156,13 @@ def test_a_lens_is_certain_after_a_large_turn_seen_from_near_and_uncertain_after
     _, far = deviation_of_lens(5, 12)
     assert near < 0.03
     assert far > 0.15
+
+
+def test_a_lens_that_a_small_turn_excludes_is_left_and_one_that_it_allows_is_kept():
+    error, deviation = deviation_of_lens(20, 8, factor=3.0)
+    assert deviation > LENS_KNOWN and abs(error) < 0.5 * np.log(3.0)
+    error, deviation = deviation_of_lens(20, 8, factor=1.2)
+    assert deviation > LENS_KNOWN and error == pytest.approx(-np.log(1.2))
 
 
 def test_the_error_of_a_lens_is_what_its_deviation_leads_to_expect():

@@ -73,5 +73,15 @@ def test_of_two_that_see_the_same_the_sharper_one_stays():
         assert {one.index for one in views} == {0, 2}
 
 
+def test_of_two_that_see_the_same_the_one_that_something_hides_goes_however_sharp_it_is():
+    image, mask = seen(pose(0), pattern())
+    left = mask & (np.arange(mask.shape[1]) < np.flatnonzero(mask.any(0)).mean())
+    hidden = texture_view(ObjectView.of_frame(1, image, left, CAMERA, pose(0)))
+    soft = texture_view(ObjectView.of_frame(3, cv2.GaussianBlur(image, (0, 0), 3), mask, CAMERA, pose(0)))
+    assert hidden is not None and soft is not None and hidden.sharpness > 2 * soft.sharpness
+    for order in ((hidden, soft), (soft, hidden)):
+        assert [one.index for one in keep_best_views(order[:1], order[1], 1)] == [3]
+
+
 def test_none_are_kept_where_none_are_asked_for():
     assert keep_best_views((), view(0, 0.0), 0) == ()

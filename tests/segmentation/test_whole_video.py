@@ -129,6 +129,28 @@ def test_only_masks_that_something_contradicts_are_decided_where_masks_may_be_ke
     assert {index for index, decided in found.items() if decided is not None} == {0, 2, 3}
 
 
+def with_gap(number: int, filled: bool) -> ObjectView:
+    """The background shows through the middle, which surface and, if ``filled``, both masks call the object."""
+    one = answered(number)
+    gap = np.hypot(*(np.mgrid[:120, :160] - np.array([59.5, 50 + 4 * number])[:, None, None])) < 14
+    background = cv2.GaussianBlur(texture(0, 20, 150)[:120, :160], (0, 0), 9)
+    image = np.where(one.mask[..., None] & ~gap[..., None], one.image, background)
+    mask = one.mask if filled else one.mask & ~gap
+    return replace(one, image=image, mask=mask, initial=mask)
+
+
+@pytest.mark.parametrize("filled", [range(0, 12, 3), range(12)])
+def test_masks_that_nothing_contradicts_are_decided_where_other_frames_see_through_them(filled):
+    frames = [with_gap(number, number in filled) for number in range(12)]
+    known = VideoSegmenter(
+        CAMERA, VERTICES, FACES, {one.index: 0.9 for one in frames}, may_keep=range(12), agreement=0.95
+    )
+    for one in frames:
+        known.see(one)
+    known.settle()
+    assert known.kept == (set(filled) if len(filled) == len(frames) else set())
+
+
 def test_frames_whose_poses_are_doubted_are_not_decided():
     doubted = range(9, 30)
     frames = [answered(number % 12, index=number) for number in range(30)]

@@ -103,7 +103,8 @@ def answers_of(folder: Path) -> list[dict[str, Any]]:
     return [{name: value for name, value in line.items() if name not in TIMES} for line in lines]
 
 
-@pytest.mark.parametrize("weighs", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("weighs", [True, False])
 def test_parts_come_to_what_one_process_comes_to(weighs, frames, tmp_path):
     config = settings(frames, f"object.refine_masks={str(weighs).lower()}", "runtime.probabilities=true")
     whole = looked_at_again(frames, config, tmp_path / "whole")

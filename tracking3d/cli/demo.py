@@ -70,11 +70,11 @@ def _score(run_folder: Path, clip: Path) -> dict[str, float | None]:
 
     import numpy as np
 
+    from tracking3d.frames import mask_iou_or_none
     from tracking3d.geometry.alignment import rotation_alignment, transposed_product
     from tracking3d.results import layout
     from tracking3d.results.description import time_per_frame
     from tracking3d.results.files import read_mask
-    from tracking3d.results.records import mask_iou_or_none
     from tracking3d.results.run_reader import RunReader
 
     run = RunReader(run_folder)

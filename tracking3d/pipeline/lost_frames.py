@@ -24,12 +24,11 @@ from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.initialization.start_window import score_starts
 from tracking3d.estimation.solver import Gap, PhotoSet
-from tracking3d.frames import TRACKED_CONFIDENCE, Box, Frame, MaskEstimate
+from tracking3d.frames import TRACKED_CONFIDENCE, Box, Frame, MaskEstimate, mask_iou_or_none
 from tracking3d.pipeline.frame_reading import SavedMasks, read_again, read_timed
 from tracking3d.pipeline.session import Session
 from tracking3d.results.description import StartOfModel
 from tracking3d.results.files import pack, unpack
-from tracking3d.results.records import mask_iou_or_none
 from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.first_mask import mask_with_network

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PluginChoice
-from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.frames import Frame, MaskEstimate, Prompt, mask_iou_or_none
 from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
-from tracking3d.results.records import mask_iou_or_none
 from tracking3d.runtime.stage_times import in_stage
 from tracking3d.trackers.crops import box_of
 

@@ -16,6 +16,7 @@ collected, are done once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,13 +30,12 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.segmentation.temporal_neighbours import REACH
 from tracking3d.estimation.segmentation.whole_video import (
-    LARGEST_AGAIN,
     SegmentedMask,
     VideoSegmenter,
     draw_around_masks,
 )
 from tracking3d.estimation.solver import LEAST_FRAMES, RefinedStart
-from tracking3d.frames import Frame
+from tracking3d.frames import Frame, mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.pipeline.frame_reading import SavedMasks
 from tracking3d.pipeline.session import Session
@@ -43,7 +43,7 @@ from tracking3d.reconstruction.confidence import assess_estimate
 from tracking3d.reconstruction.global_adjustment import GlobalAdjustment, HeldAdjustment
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
-from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.results.refinement_writer import adjusted_record
 from tracking3d.results.run_reader import RunReader
@@ -67,6 +67,11 @@ class PrecomputedRefinement:
     # the masks of frames that were estimated again after the adjustment, as PNG, by index
     retracked: Mapping[int, bytes]
     kept_masks: int = 0  # number of masks that were not segmented again because nothing contradicts them
+
+
+_LOST_OVERLAP = 0.1
+"""IoU of silhouette and mask that a causal pose may lose by another lens (chosen: 0 to .03 where the map stayed, .2 to
+.6 on bowl_flip, whose map moved with its lens)."""
 
 
 class Retracking:
@@ -96,13 +101,15 @@ class Retracking:
         self.most_degrees = session.config.object.retrack_angle
         self.least_agreement = least = session.config.object.mask_agreement
         if earlier is None and self.most_degrees:
+            model = session.result()
+            self._surface = np.asarray(model.vertices, np.float64), np.asarray(model.faces, np.int64)
             self._start = self._refined_keyframes()
             undoubted = (
                 one.index
                 for one in self._causal.values()
                 if one.status is Status.TRACKED and (one.iou_initial is None or one.iou_initial > least)
             )
-            self.kept = frozenset(undoubted if self._start else ())
+            self.kept = frozenset(filter(self._is_predictable, undoubted) if self._start else ())
 
     def _refined_keyframes(self) -> RefinedStart | None:
         poses = {index: T for index, T in self._session.keyframe_poses().items() if index in self._causal}
@@ -111,11 +118,23 @@ class Retracking:
         causal = {index: self._causal[index] for index in poses}
         return RefinedStart(
             self._camera,
-            np.asarray(self._session.result().vertices, np.float64),
+            self._surface[0],
             poses,
             {index: one.T_cam_obj for index, one in causal.items()},
             {index: one.through(self._camera).fx for index, one in causal.items()},
         )
+
+    def _is_predictable(self, index: int) -> bool:
+        """Whether a causal pose still explains its mask as it is predicted, if it was found through another lens."""
+        record, camera = self._causal[index], self._camera
+        if math.isclose(record.through(camera).fx, camera.fx):
+            return True
+        mask = camera.mask_to_pinhole(self._masks.estimates.mask(record))
+        image, pose = np.zeros((*mask.shape, 3), np.uint8), self.predict(record)
+        view = ObjectView.of_frame(index, image, mask, replace(camera, lens=None), pose, initial=mask)
+        drawn = draw_around_masks(view, *self._surface, again=True)
+        overlap = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
+        return (overlap or 0.0) > record.diagnostics.get("mask_iou", 1.0) - _LOST_OVERLAP
 
     def keep(self, index: int) -> FrameRecord | None:
         """The causal estimate of a frame as a refined one; None if it is to be estimated again."""
@@ -235,8 +254,9 @@ class RefinementSteps:
         assert isinstance(self.look, GlobalAdjustment) and self._retracking is not None
         if self.look.deviation(record, T_cam_obj) > self._retracking.most_degrees:
             return True
-        surface = self.look.vertices_of_landmarks, self.look.faces, LARGEST_AGAIN
-        self._drawn = drawn = draw_around_masks(self._segmentation_input(frame, T_cam_obj), *surface)
+        surface = self.look.vertices_of_landmarks, self.look.faces
+        view = self._segmentation_input(frame, T_cam_obj)
+        self._drawn = drawn = draw_around_masks(view, *surface, again=True)
         agreement = None if drawn is None else mask_iou_or_none(drawn.mask, drawn.silhouette)
         return (agreement or 0.0) <= self._retracking.least_agreement
 

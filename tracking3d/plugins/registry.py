@@ -207,7 +207,7 @@ _ADVICE: dict[str, dict[str, str]] = {
         ),
         **dict.fromkeys(("none", "color", "colour", "pixels", "image"), "did you mean 'rgb'?"),
     },
-    KEYPOINTS: dict.fromkeys(("edgepoint", "edgepoint2"), "did you mean 'network'?"),
+    KEYPOINTS: dict.fromkeys(("edgepoint", "edgepoint2"), "it is the plug-in tracking3d-edgepoint2"),
 }
 """By group, and by name in small letters without hyphens and versions."""
 

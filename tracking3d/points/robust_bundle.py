@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.geometry.camera import LENS_KNOWN
+from tracking3d.geometry.camera import LENS_EXCLUDED, LENS_KNOWN
 from tracking3d.points.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.points.bundle_adjustment.adjustment import Reversal, reversal_of
 from tracking3d.scene.view import Array
@@ -142,7 +142,9 @@ def bundle(
         # The loss is half of minus twice the logarithm of the likelihood, in units of squared outliers.
         information = 0.5 * _OUTLIER**2 * found.focal_curvature / tracked
         deviation_of_lens = 1 / math.sqrt(information + _LENS**-2)
-        if deviation_of_lens > LENS_KNOWN or not gain > (math.log(found.focal_factor) / _LENS) ** 2:
+        change = abs(math.log(found.focal_factor))
+        told = deviation_of_lens <= LENS_KNOWN or change > LENS_EXCLUDED * deviation_of_lens
+        if not told or not gain > (change / _LENS) ** 2:
             return replace(begun, focal_deviation=deviation_of_lens)
     T = T_cam_obj.copy()
     T[:, :3, :3], T[:, :3, 3] = found.R, found.t

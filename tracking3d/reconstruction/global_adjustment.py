@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.estimation.online.features.klt import grey, has_texture, texture_strength
 from tracking3d.frames import Image
-from tracking3d.geometry.camera import DEFAULT_ORIGIN, LENS_KNOWN, Camera
+from tracking3d.geometry.camera import DEFAULT_ORIGIN, LENS_EXCLUDED, LENS_KNOWN, Camera
 from tracking3d.points.landmark_adjustment import (
     LandmarkScene,
     LandmarkSupport,
@@ -43,9 +43,9 @@ _USUAL_VIEWS, _DEGREES_A_VIEW = (24, 48), 5.0
 were kept, if these share too few. The time of a round grows with the square of their number."""
 _FRAMES_A_VIEW = 5  # frames of a long video for each view that is bundled
 _LEAST_VIEWS = 4
-# Deviations by which the default lens is off where it is not taken, and degrees that views are then apart (chosen: the
-# photos of the car have 12 and 160; deviations of views from one side are too small).
-_EXCLUDED, _SIDES_APART = 4.0, 60.0
+# Degrees that views are apart where the default lens may be excluded (chosen: the photos of the car have 160;
+# deviations of views from one side are too small).
+_SIDES_APART = 60.0
 _Pose = NDArray[np.float64]
 
 
@@ -142,7 +142,7 @@ class GlobalAdjustment:
             return refined
         R = np.stack([T[:3, :3] for T in self._before.values()])
         turn = np.degrees(np.arccos(np.clip((np.einsum("aij,bij->ab", R, R).min() - 1) / 2, -1, 1)))
-        if turn > _SIDES_APART and abs(math.log(factor / refined.focal_factor)) > _EXCLUDED * deviation:
+        if turn > _SIDES_APART and abs(math.log(factor / refined.focal_factor)) > LENS_EXCLUDED * deviation:
             return refined
         poses = [_through_lens(T, factor) for T in self._before.values()]
         refined = refine_scene(scene.redrawn(self.vertices, dict(enumerate(poses)), factor), rounds)

@@ -12,6 +12,7 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.frames import mask_iou_or_none
 from tracking3d.reconstruction.run_views import (
     RunViews,
     collect_views,
@@ -25,7 +26,7 @@ from tracking3d.reconstruction.views import keep_best_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.notes import notes_of_run
-from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.redrawing import redraw_contact_sheet
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader

@@ -13,6 +13,7 @@ from tracking3d.trackers.crops import box_of
 SIDE = 192
 """Pixels of the side of a view that a shape is made from; a smaller window is seen larger."""
 _LARGEST = 640  # pixels of the side of a view that a texture is taken from; a larger window is seen smaller
+_MOSTLY_SHOWN = 0.8  # share of another such view's area from which nothing hides the object (chosen)
 _MARGIN, _TEXTURE_MARGIN = 0.08, 0.05  # around the mask, relative to its longer side
 
 
@@ -35,7 +36,10 @@ def shape_view(frame: ObjectView, side: int = SIDE) -> ObjectView | None:
 
 
 def keep_best_views(views: tuple[ObjectView, ...], view: ObjectView, most: int) -> tuple[ObjectView, ...]:
-    """The views with one more; of more than ``most`` the less sharp of the two that see most alike goes."""
+    """The views with one more; of more than ``most`` one of the two that see most alike goes.
+
+    That is the one that shows clearly less, since something hides the object, or else the less sharp one.
+    """
     if most < 1:
         return ()
     views = (*views, view)
@@ -44,8 +48,16 @@ def keep_best_views(views: tuple[ObjectView, ...], view: ObjectView, most: int) 
     directions = np.stack([one.direction for one in views])
     likeness = np.triu(directions @ directions.T, 1) - 2 * np.tri(len(views))
     pair = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
-    dropped = min((int(place) for place in pair), key=lambda place: (views[place].sharpness, -place))
+    areas = {int(place): _shown_area(views[place]) for place in pair}
+    dropped = min(areas, key=areas.__getitem__)
+    if areas[dropped] >= _MOSTLY_SHOWN * max(areas.values()):
+        dropped = min(areas, key=lambda place: (views[place].sharpness, -place))
     return (*views[:dropped], *views[dropped + 1 :])
+
+
+def _shown_area(view: ObjectView) -> float:
+    """The mask's area at the object's distance, in units of the object squared."""
+    return float(np.count_nonzero(view.mask) * view.T_cam_obj[2, 3] ** 2 / (view.K[0, 0] * view.K[1, 1]))
 
 
 def spread_by_rotation(views: Sequence[ObjectView], degrees: float, most: int) -> list[ObjectView]:

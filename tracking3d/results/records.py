@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainValidator, TypeAdapter, ValidationError
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
-from tracking3d.frames import SkippedFrame
+from tracking3d.frames import SkippedFrame, mask_iou_or_none
 from tracking3d.geometry.alignment import nearest_rigid
 from tracking3d.geometry.camera import Camera
 from tracking3d.runtime.stage_times import StageTimes
@@ -191,13 +191,6 @@ def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRe
             record = replace(record, seconds=before.seconds, stages=before.stages)
         estimates[record.index] = replace(record, name=before.name) if before and not record.name else record
     return [estimates[index] for index in sorted(estimates)]
-
-
-def mask_iou_or_none(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
-    """Intersection over union of two ``(H, W)`` masks; None if one is absent or both are empty."""
-    if b is None or not (union := np.count_nonzero(a | b)):
-        return None
-    return float(np.count_nonzero(a & b) / union)
 
 
 def jsonable(value: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.frames import Frame, MaskEstimate, mask_iou_or_none
 from tracking3d.results import layout
 from tracking3d.results.files import (
     decode_mask,
@@ -22,7 +22,7 @@ from tracking3d.results.files import (
     write_probability,
     writing,
 )
-from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.runtime.stage_times import measure
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Window
@@ -53,6 +54,11 @@ class Cues:
             global_colours=self.global_colours * factor,
             local_colours=self.local_colours * factor,
         )
+
+
+def weight(default: float, description: str) -> Any:
+    """The field of a cue's weight in the options of a tracker."""
+    return Field(default, ge=0, le=100, description=description)
 
 
 def colour_and_motion(

@@ -16,7 +16,7 @@ from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.box_trackers import OpenCvBoxes
 from tracking3d.trackers.crops import box_iou, box_of, check_box_in_frame
 from tracking3d.trackers.csrt import STRAYED, BoxTracker, CsrtTracker
-from tracking3d.trackers.cues import Cues
+from tracking3d.trackers.cues import Cues, weight
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
@@ -38,47 +38,24 @@ class FlowTracker:
         segmentation_size: int = Field(
             224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
         )
-        prior: float = Field(
-            _CUES.prior, ge=0, le=100, description="Weight of the distance to the outline of the moved mask."
-        )
-        outline: float = Field(
-            _CUES.outline,
-            ge=0,
-            le=100,
-            description="Weight in the prior of the last outline, only translated.",
-        )
+        prior: float = weight(_CUES.prior, "Weight of the distance to the outline of the moved mask.")
+        outline: float = weight(_CUES.outline, "Weight in the prior of the last outline, only translated.")
         similarity: bool = Field(
             _CUES.similarity,
             description="Also use a prior from one similarity transform, fitted to consistent flow.",
         )
-        global_colours: float = Field(
-            _CUES.global_colours,
-            ge=0,
-            le=100,
-            description="Weight of the object's and background's colour models.",
+        global_colours: float = weight(
+            _CUES.global_colours, "Weight of the object's and background's colour models."
         )
-        local_colours: float = Field(
-            _CUES.local_colours, ge=0, le=100, description="Weight of local colours in the previous frame."
-        )
-        motion: float = Field(
-            _CUES.motion,
-            ge=0,
-            le=100,
-            description="Weight of motion consistent with the object or the background.",
-        )
-        background: float = Field(
-            _CUES.background, ge=0, le=100, description="Weight of differences from the learnt background."
-        )
-        novelty: float = Field(
-            _CUES.novelty, ge=0, le=100, description="Weight of unseen colours inside the outline."
-        )
+        local_colours: float = weight(_CUES.local_colours, "Weight of local colours in the previous frame.")
+        motion: float = weight(_CUES.motion, "Weight of motion consistent with the object or the background.")
+        background: float = weight(_CUES.background, "Weight of differences from the learnt background.")
+        novelty: float = weight(_CUES.novelty, "Weight of unseen colours inside the outline.")
         smoother: bool = Field(_CUES.smoother, description="Smooth the log-odds along image edges.")
         witness: Literal["none", "csrt", "kcf"] = Field(
             "none", description="Box tracker that checks the mask and recovers it if it is lost."
         )
-        witness_weight: float = Field(
-            _CUES.box, ge=0, le=100, description="Weight of the distance outside the box tracker's box."
-        )
+        witness_weight: float = weight(_CUES.box, "Weight of the distance outside the box tracker's box.")
 
     def __init__(self, options: FlowTracker.Options) -> None:
         self._options = options

@@ -157,6 +157,16 @@ def test_the_reason_names_what_speaks_most_against_the_pose():
         assert words in _doubt(one, evidence), words
 
 
+def test_of_a_finished_plain_map_the_lead_over_other_rotations_decides():
+    loose = replace(fit(overlap=0.98), information=torch.zeros(6, 6))
+    first, second = (
+        assess_pose(loose, USUAL, PoseEvidence(0, untextured=True, lead=lead)) for lead in (0.9, 0.1)
+    )
+    assert first.status is Status.TRACKED and second.status is Status.UNCERTAIN
+    assert assess_pose(fit(overlap=0.85), USUAL, PoseEvidence(0, lead=0.9)).status is Status.UNCERTAIN
+    assert assess_pose(loose, USUAL, PoseEvidence(0, untextured=True)).status is Status.UNCERTAIN
+
+
 def test_rotation_about_a_free_axis_is_not_judged_but_the_outline_is():
     free = PoseEvidence(0, untextured=True, free_axis=np.array([0.0, 1.0, 0.0]))
     loose = replace(fit(overlap=0.96, unseen=0.3), information=torch.zeros(6, 6))

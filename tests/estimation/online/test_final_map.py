@@ -14,6 +14,7 @@ import trimesh
 from turned_solid import CAMERA, degrees_apart, turned_map
 
 from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online.initialization.initial_map import lead_over_rivals, reverse_rotations
 from tracking3d.estimation.online.mapping import global_refinement
 from tracking3d.estimation.online.mapping.global_refinement import (
     keyframe_cost,
@@ -101,3 +102,16 @@ def test_keyframes_from_all_of_the_video_stay(monkeypatch):
     indices = [view.index for view in found.keyframes]
     assert indices[0] == 0 and indices[-1] == 78  # every second frame of them is a keyframe
     assert len(indices) == 16 and max(b - a for a, b in pairwise(indices)) <= 6
+
+
+def test_right_rotations_lead_and_reversed_ones_do_not():
+    truth = turned_map([12.0 * n for n in range(8)])
+    views = list(truth.keyframes)
+    poses = zip(views, reverse_rotations(views, CAMERA), strict=True)
+    reversed_views = tuple(replace(view, pose=pose) for view, pose in poses)
+    wrong = replace(truth, vertices=truth.shape.rest, keyframes=reversed_views)
+    right, led = (
+        lead_over_rivals(refit_without_points(one, FitWeights()), CAMERA, FitWeights())
+        for one in (truth, wrong)
+    )
+    assert right > 0.05 and led < -0.5

@@ -14,7 +14,11 @@ from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapper import adopt_free_axis
-from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution, find_free_axis
+from tracking3d.estimation.online.mapping.free_axis import (
+    as_surface_of_revolution,
+    find_free_axis,
+    look_revolved,
+)
 from tracking3d.estimation.online.mapping.global_refinement import fit_keyframes
 from tracking3d.estimation.online.optimization.revolution import FreeAxis
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
@@ -92,6 +96,13 @@ def test_the_axis_of_a_plain_pear_is_found_and_passes_through_it() -> None:
 @pytest.mark.parametrize("change", [{"handle": 0.6}, {"marks": 0.3}])
 def test_a_handle_or_a_mark_tells_the_rotation(change) -> None:
     assert find_free_axis(tumbling(**change)) is None
+
+
+def test_views_of_unknown_poses_tell_whether_rotations_can_be_seen() -> None:
+    views = tumbling().keyframes
+    assert look_revolved(views)
+    assert not look_revolved(views[:5])
+    assert not look_revolved(tumbling(handle=0.6).keyframes)
 
 
 def test_few_views_or_one_with_a_handle_among_the_others_are_not_enough() -> None:

@@ -88,6 +88,11 @@ def test_keyframes_that_are_turned_by_two_degrees_come_back():
     assert refine(once) is once  # nothing is new
 
 
+def centre(state: SolverState) -> torch.Tensor:
+    """``(3,)`` of the object."""
+    return state.object_map.vertices.mean(0)
+
+
 def test_the_first_keyframe_stays_and_the_last_pose_is_that_of_the_newest():
     before = disturbed()
     after = refine(replace(before, last_pose=(before.last_pose[0], newest(before).index)))
@@ -126,11 +131,14 @@ def test_a_focal_length_that_nobody_gave_is_found_and_the_state_moves_with_it(fa
         found = refine(found)
     assert abs(np.log(found.camera.fy / clip().camera.fy)) < 0.4 * abs(np.log(factor))
     assert found.camera.assumed
-    centre = np.zeros((1, 3))
+    assert torch.allclose(
+        centre(found), centre(state), atol=0.1 * object_map.radius
+    )  # not moved along the rays
+    origin = np.zeros((1, 3))
     before = {index: pose for pose, index in state.trajectory}
     pose, index = found.trajectory[-1]
-    there = project_points(centre, pose, found.camera)
-    assert there == pytest.approx(project_points(centre, before[index], state.camera), abs=2.0)
+    there = project_points(origin, pose, found.camera)
+    assert there == pytest.approx(project_points(origin, before[index], state.camera), abs=2.0)
 
 
 def test_a_given_focal_length_stays():

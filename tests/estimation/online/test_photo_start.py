@@ -11,6 +11,7 @@ import pytest
 from online_runs import estimate_of, frame, known_run, solver, true_mask, turning_clip
 from scipy.spatial.transform import Rotation
 
+from tracking3d.config.loading import load_config
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.sift import Keypoints
 from tracking3d.estimation.online.initialization import photo_start
@@ -35,12 +36,17 @@ from tracking3d.estimation.online.initialization.photo_tracks import (
     match_photos,
     neighbouring_pairs,
 )
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.solver import PhotoSet
+from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
 from tracking3d.points.bundle_adjustment.adjustment import Tracks
 from tracking3d.testing.synthesis import convex_clips
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
+from tracking3d_bench.synthesis.sequences import render_sequence
+from tracking3d_bench.synthesis.spec import SequenceSpec
 
 STEP = 20.0
 K = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
@@ -165,6 +171,23 @@ def test_photos_of_a_plain_object_are_not_blamed_for_their_steps(plain, monkeypa
     assert ("hardly any texture" in found.reason) is plain is not bool(matched)
     if plain:
         assert not found.estimates and state.waiting_reason == found.reason
+
+
+def test_photos_of_a_vase_of_rings_are_not_blamed_for_their_steps():
+    spec = SequenceSpec(
+        name="vase", object="vase", motion="turntable", frames=7, size=(240, 180), degrees_per_frame=STEP
+    )
+    made = render_sequence(spec)
+    photos = [Frame(n, image) for n, image in enumerate(made.images)]
+    masks = [estimate_of(mask > 0.5) for mask in made.masks]
+    photo_set = PhotoSet(
+        tuple(range(7)), lambda indices: ((photos[index], masks[index]) for index in indices)
+    )
+    fresh = OnlineSolver(
+        load_config(overrides=["object.frequency=7"]), Camera.from_fov(*spec.size), RgbEncoder()
+    )
+    _, found = fresh.start_from_photos(fresh.init(photos[0], masks[0])[0], photo_set)
+    assert found.reason.startswith("7 photos, none joined; it looks the same from all sides")
 
 
 def test_what_is_known_to_be_plain_is_not_looked_at_as_photos():

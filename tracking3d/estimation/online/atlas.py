@@ -34,7 +34,7 @@ from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, LossBas
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import InactiveMap, Mapped
 from tracking3d.estimation.segmentation import as_lab
-from tracking3d.frames import TRACKED_CONFIDENCE, Frame
+from tracking3d.frames import TRACKED_CONFIDENCE, Frame, mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.geometry.similarity import Similarity
@@ -311,8 +311,7 @@ def _with_merged_map(
 
 
 _COMPARED_KEYFRAMES = 4  # keyframes of the first map that each of the second is compared with
-# Pixels at an object size of 200 pixels, between both projections of a landmark
-_MAX_REPROJECTION_ERROR = 20.0
+_MAX_REPROJECTION_ERROR = 20.0  # pixels at an object size of 200, between both projections of a landmark
 
 Pairs = NDArray[np.int64]
 """``(N, 2)`` indices of landmarks of the first and second map that are the same point of the object."""
@@ -434,10 +433,7 @@ def needs_second_map(state: Mapped, image: NDArray[np.uint8], mask: NDArray[np.b
 
 def masks_overlap(before: NDArray[np.bool_] | None, mask: NDArray[np.bool_]) -> bool:
     """Whether the masks ``(H, W)`` of two frames overlap enough to show the same object."""
-    if before is None:
-        return False
-    either = int(np.count_nonzero(before | mask))
-    return int(np.count_nonzero(before & mask)) > _MIN_MASK_IOU * either
+    return (mask_iou_or_none(mask, before) or 0.0) > _MIN_MASK_IOU
 
 
 def is_fully_visible(mask: NDArray[np.bool_]) -> bool:

@@ -42,6 +42,7 @@ from tracking3d.estimation.online.initialization.photo_start import (
 )
 from tracking3d.estimation.online.initialization.photo_tracks import Photo
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.free_axis import look_revolved
 from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
 from tracking3d.estimation.online.mapping.keyframe_insertion import (
     cut_around_object,
@@ -85,6 +86,7 @@ from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.runtime.stage_times import in_stage
 
 _PLAIN = "the object has hardly any texture: no points join its photos"
+_REVOLVED = "it looks the same from all sides: its turns about its axis cannot be seen"
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
@@ -238,9 +240,8 @@ class Initializer:
         places = np.linspace(0, len(photos.indices) - 1, min(MOST_PHOTOS, len(photos.indices)))
         chosen = [photos.indices[place] for place in places.round().astype(int)]
         begun: Initializing | None = None
-        is_network = isinstance(observer.detector, NetworkDetector)
-        other: Detector = SIFT if is_network else NetworkDetector(NetworkDetector.Options())
-        detectors = observer.detector, other
+        own = observer.detector
+        detectors = own, NetworkDetector(NetworkDetector.Options()) if own.rotation_invariant else SIFT
         kinds: tuple[list[Photo], ...] = tuple([] for _ in detectors)
         waiting, strengths = list[Pending](), list[float]()
         for frame, mask in photos.read(chosen):
@@ -261,6 +262,8 @@ class Initializer:
         start = None if plain else start_of_photos(kinds, camera)
         if begun is None or start is None or start.structure is None:
             reason = _PLAIN if start is None else start.reason
+            if start is not None and look_revolved([view for view, _ in waiting]):
+                reason = f"{len(waiting)} photos, none joined; {_REVOLVED}"
             if isinstance(state, Initializing):
                 state = replace(state, waiting_reason=reason)
             return state, PhotoEstimates((), reason)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -119,6 +120,7 @@ def make_estimate(
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": view.mask_weight,
+            **({} if math.isnan(found.evidence.lead) else {"lead": found.evidence.lead}),
             MOTION_RATIO: weighed.moving,
         },
     )

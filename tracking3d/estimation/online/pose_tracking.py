@@ -131,6 +131,7 @@ def pose_evidence(
         object_map.pointless,
         has_texture([one.strength for one in object_map.keyframes if math.isfinite(one.strength)]),
         None if object_map.free_axis is None else object_map.free_axis.direction,
+        object_map.lead,
     )
 
 

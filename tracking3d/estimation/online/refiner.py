@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.features.klt import FollowedPoints, grey
-from tracking3d.estimation.online.initialization.initial_map import restart_without_points
+from tracking3d.estimation.online.initialization.initial_map import lead_over_rivals, restart_without_points
 from tracking3d.estimation.online.mapping.focal_length import inactive_map_through_lens, with_focal_length
 from tracking3d.estimation.online.mapping.free_axis import as_surface_of_revolution
 from tracking3d.estimation.online.mapping.global_refinement import refine_globally, refit_without_points
@@ -57,6 +57,8 @@ def refine_active_map(state: Mapped, config: OnlineConfig) -> Mapped:
             object_map = as_surface_of_revolution(object_map, weights, others)
     if plain and object_map.free_axis is None:
         object_map = refit_without_points(object_map, weights)
+        if len(object_map.keyframes) > 1:
+            object_map = replace(object_map, lead=lead_over_rivals(object_map, camera, weights))
     else:
         object_map, camera = refine_globally(object_map, camera, config)
     return replace(

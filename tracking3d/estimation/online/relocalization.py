@@ -29,6 +29,7 @@ from tracking3d.estimation.online.pose_tracking import (
 )
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
+from tracking3d.frames import mask_iou_or_none
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, pose_arrays, rotation_about
 from tracking3d.rendering import Surface
@@ -221,5 +222,4 @@ def relocalize_in_frame(
 
 def overlaps_mask(silhouette: NDArray[np.bool_], mask: NDArray[np.bool_]) -> bool:
     """Whether a mask overlaps the relocalized object: then it counts as any other mask does."""
-    either = int(np.count_nonzero(silhouette | mask))
-    return int(np.count_nonzero(silhouette & mask)) > ELSEWHERE * either
+    return (mask_iou_or_none(silhouette, mask) or 0.0) > ELSEWHERE

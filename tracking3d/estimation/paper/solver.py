@@ -33,7 +33,7 @@ from tracking3d.estimation.shape import (
 )
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.features.protocol import FeatureEncoder
-from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.frames import Frame, MaskEstimate, mask_iou_or_none
 from tracking3d.geometry.camera import NEAR, Camera
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_angle, rotation_exponential
 from tracking3d.rendering import BackProjection, TexelMap, back_project, project, rasterize
@@ -301,7 +301,7 @@ class PaperSolver:
         """The rendered mask, or the initial one where the two differ too much (`solver.min_mask_iou`)."""
         if initial is None:
             return rendered, MaskSource.RENDERED, assessment
-        iou = float(np.sum(rendered & initial)) / max(float(np.sum(rendered | initial)), 1.0)
+        iou = mask_iou_or_none(rendered, initial) or 0.0
         if iou >= self.settings.min_mask_iou:
             return rendered, MaskSource.RENDERED, assessment
         reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"

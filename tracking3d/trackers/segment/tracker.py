@@ -18,7 +18,7 @@ from tracking3d.scene.view import FrameCrop
 from tracking3d.trackers.box_trackers import BoxOffset, Lookahead
 from tracking3d.trackers.colour_models import GlobalColours
 from tracking3d.trackers.crops import box_of, check_box_in_frame, paste_mask
-from tracking3d.trackers.cues import Cues
+from tracking3d.trackers.cues import Cues, weight
 from tracking3d.trackers.first_mask import mask_with_network
 from tracking3d.trackers.mask_motion import MaskMotion
 from tracking3d.trackers.opencv_build import why_no_contrib
@@ -125,19 +125,13 @@ class SegmentTracker:
         segmentation_size: int = Field(
             224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
         )
-        network: float = Field(_CUES.network, ge=0, le=100, description="Weight of the network's log-odds.")
-        colours: float = Field(
+        network: float = weight(_CUES.network, "Weight of the network's log-odds.")
+        colours: float = weight(
             _CUES.global_colours,
-            ge=0,
-            le=100,
-            description="Weight of the object's and background's colours, of the whole object and nearby.",
+            "Weight of the object's and background's colours, of the whole object and nearby.",
         )
-        motion: float = Field(
-            _CUES.motion, ge=0, le=100, description="Weight of motion consistent with the object."
-        )
-        background: float = Field(
-            _CUES.background, ge=0, le=100, description="Weight of differences from the learnt background."
-        )
+        motion: float = weight(_CUES.motion, "Weight of motion consistent with the object.")
+        background: float = weight(_CUES.background, "Weight of differences from the learnt background.")
         threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
 
     def __init__(self, options: SegmentTracker.Options) -> None:

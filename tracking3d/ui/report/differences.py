@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
+from tracking3d.frames import mask_iou_or_none
 from tracking3d.geometry.alignment import align_object_frame
 from tracking3d.results.files import read_mask
-from tracking3d.results.records import jsonable, mask_iou_or_none
+from tracking3d.results.records import jsonable
 from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.progress import report_each
 from tracking3d.runtime.stage_times import STAGES

@@ -27,6 +27,8 @@ from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import RADIUS, place_on_mask
+from tracking3d.frames import mask_iou_or_none
+from tracking3d.geometry.alignment import rotation_alignment
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import (
     Pose,
@@ -54,6 +56,9 @@ _LAST_EVALUATIONS = 5  # of the best one
 _VIEWS_AGAIN = 12  # keyframes from which a map is restarted (chosen)
 _CLEARLY_BETTER = 0.95  # share of the costs of the present map and the best other rotation (chosen)
 _SAME_ROTATION = 10.0  # degrees up to which two hypotheses are one (chosen)
+_RIVAL_EVALUATIONS = 12  # of a rotation that a finished map is compared with (as its own fit has)
+_LARGEST_LEAD = 2.0  # (chosen)
+_TURNS_OTHERWISE = 15.0  # degrees, mean over the views after alignment (chosen among 10, 15 and 20)
 _MISSED = 0.3  # cost of masks that are missed wholly (chosen)
 
 
@@ -208,6 +213,34 @@ def restart_without_points(object_map: ObjectMap, camera: Camera, weights: FitWe
     others = [one for one, rival, _ in rivals if _degrees_apart(rival, found) > _SAME_ROTATION]
     clear = cost < _CLEARLY_BETTER * min([before, *others])
     return _without_points(found) if clear else object_map
+
+
+def lead_over_rivals(object_map: ObjectMap, camera: Camera, weights: FitWeights) -> float:
+    """The logarithm by which fits of other rotations to the keyframes of a map without points cost more than its own.
+
+    The rivals, its reversal and rotations near it, begin with the prototype. The joint cost, with light, tells right
+    rotations of a whole video from wrong ones where that of each frame does not.
+
+    Args:
+        object_map: The map, fitted to its keyframes.
+        camera: The camera of the full frame.
+        weights: The weights of the shape's terms.
+
+    Returns:
+        That of the cheapest rival that turns otherwise, at most `_LARGEST_LEAD`: so, too, if all end as the map turns.
+    """
+    modes, views = ShapeBasis.of(object_map.shape), list(object_map.keyframes)
+    poses, blank = [view.pose for view in views], replace(object_map, vertices=object_map.shape.rest)
+    own, cost = Pose.stack(poses).R.double().numpy(), fit_jointly(object_map, modes, weights, 0)[1]
+    others = [_LARGEST_LEAD]
+    for rotations in (reverse_rotations(views, camera), *vary_rotations(views, poses, camera)):
+        start = replace(blank, keyframes=_with_poses(views, rotations))
+        rival, its_cost = fit_jointly(start, modes, weights, _RIVAL_EVALUATIONS)
+        R = Pose.stack([view.pose for view in rival.keyframes]).R.double().numpy()
+        apart = R @ rotation_alignment(R, own) @ own.transpose(0, 2, 1)
+        if Rotation.from_matrix(apart).magnitude().mean() > math.radians(_TURNS_OTHERWISE):
+            others.append(math.log(its_cost / cost))
+    return min(others)
 
 
 _Fitted = tuple[float, ObjectMap, str]
@@ -409,7 +442,7 @@ def _turning_time(views: list[Keyframe]) -> float:
         """Mean 1 - IoU of the outlines with those of the views at the mirrored times."""
         near = np.abs(2 * turn - time[:, None] - time[None]).argmin(1)
         pairs = [(a, b) for a, b in enumerate(near) if 0 <= 2 * turn - time[a] <= time[-1] and a != b]
-        alike = [(outlines[a] & outlines[b]).sum() / (outlines[a] | outlines[b]).sum() for a, b in pairs]
+        alike = [mask_iou_or_none(outlines[a], outlines[b]) or 0.0 for a, b in pairs]
         return 1 - float(np.mean(alike)) if alike else 1.0
 
     return min((float(turn) for turn in time[-1] * np.linspace(0.25, 0.75, 11)), key=difference)

@@ -30,7 +30,8 @@ _MIN_VIEWS = 6  # views that show the object whole (chosen)
 # less on 36 sequences of other plain things (measured with true masks)
 _MIN_SYMMETRY = 0.962
 # Brightness, in [0, 1], by which an object's marks may differ from their mirror images in the median view: .053 and
-# less on nine objects without marks (shadow inside a bowl), .059 and more on two with ten strokes (measured)
+# less on nine objects without marks (shadow inside a bowl), .059 and more on two with ten strokes (measured). Between
+# photos .038 and less on four vases of rings, .147 and more on five other sets (measured)
 _MOST_MARKED = 0.055
 _MOST_QUANTILE = 0.995  # of the pixels
 _MIN_LEAD = 0.005  # IoU by which the axis leads any other that is `_OTHER` degrees away (chosen)
@@ -130,6 +131,32 @@ def as_surface_of_revolution(
     return found if overlap >= max(_MIN_OVERLAP, before - _MOST_LOST) else free
 
 
+def look_revolved(views: Sequence[Keyframe]) -> bool:
+    """Whether photos, cut out by their masks, show a surface of revolution: outlines mirror themselves, marks stay."""
+    seen = [view.observation for view in views if view.observation.has_mask]
+    mirrors = [mirror for one in seen if (mirror := _mirror(one)) is not None]
+    if len(mirrors) < _MIN_VIEWS or np.quantile([one.best for one in mirrors], 0.1) < _MIN_SYMMETRY:
+        return False
+    marks, inner = zip(*((_marks(one), _inner(one.mask.cpu().numpy()) > 0) for one in seen), strict=True)
+    moved = [_difference(marks[n], marks[n + 1], inner[n] & inner[n + 1]) for n in range(len(seen) - 1)]
+    return bool(np.median(moved) <= _MOST_MARKED)
+
+
+def _marks(seen: Observation) -> NDArray[np.float32]:
+    """``(H, W)`` brightness without what changes slowly."""
+    return np.asarray(cv2.GaussianBlur(contrast_of(seen.image, len(seen.mask))[0].cpu().numpy(), (0, 0), 1.5))
+
+
+def _inner(mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(H, W)`` 1 inside a mask, away from its outline."""
+    return np.asarray(cv2.erode((mask > 0.9).astype(np.float32), np.ones((9, 9))))
+
+
+def _difference(one: NDArray[np.float32], other: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
+    """What two pictures of marks differ by at most, but for few pixels."""
+    return float(np.quantile(np.abs(one - other)[where], _MOST_QUANTILE)) if where.any() else 0.0
+
+
 def _look_symmetric(mirrors: Sequence[_Mirror]) -> bool:
     if not mirrors:
         return True
@@ -175,11 +202,9 @@ def _mirror(seen: Observation, centre: FloatArray | None = None) -> _Mirror | No
     found = np.array([symmetry(degrees) for degrees in np.arange(0, 180, _STEP)])
     angles = _STEP * found.argmax() + np.arange(-_STEP, _STEP + 0.1, 0.5)
     best, angle = max((symmetry(degrees), degrees) for degrees in angles)
-    marks = cv2.GaussianBlur(contrast_of(seen.image, size)[0].cpu().numpy(), (0, 0), 1.5)
-    inside = cv2.erode((mask > 0.9).astype(np.float32), np.ones((9, 9)))
+    marks, inside = _marks(seen), _inner(mask)
     both = (inside > 0) & (mirrored(inside, angle) > 0.5)
-    differ = np.abs(marks - mirrored(marks, angle))[both]
-    marked = float(np.quantile(differ, _MOST_QUANTILE)) if differ.size else 0.0
+    marked = _difference(marks, mirrored(marks, angle), both)
     return _Mirror(axes, found, best, marked, bool(whole))
 
 

@@ -31,10 +31,7 @@ from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, r
 from tracking3d.points.robust_bundle import intersect
 
 _PASSES = 3
-_VIEWS_WITHOUT_POINTS, _EVALUATIONS = (
-    16,
-    12,
-)  # of a map without points (chosen; 15 evaluations more gain nothing)
+_VIEWS_WITHOUT_POINTS, _EVALUATIONS = 16, 12  # without points (chosen; 15 evaluations more: no gain)
 _FOCAL_LENGTH_PENALTY = 0.01
 """Cost by which twice or half the focal length must explain the keyframes better than the current one."""
 
@@ -173,17 +170,20 @@ def _refine_map(
     if scene.focal_factor != 1:
         solved = camera.with_solved_focal(scene.focal_factor)
         object_map, camera = map_through_lens(object_map, camera, solved), solved
-    object_map = _triangulate(_take_over(object_map, scene), camera)
+    object_map = _triangulate(_take_over(object_map, scene, camera), camera)
     positions = window_of(len(object_map.keyframes), config.local_window)
     object_map = fit_shape(object_map, positions, FitWeights(smoothness=config.smoothness), _SHAPE_ROUNDS)
     return object_map.with_textures(), camera
 
 
-def _take_over(object_map: ObjectMap, scene: LandmarkScene) -> ObjectMap:
-    """The map with a scene's surface and poses, turned so that the pose of the first keyframe stays."""
+def _take_over(object_map: ObjectMap, scene: LandmarkScene, camera: Camera) -> ObjectMap:
+    """The map with a scene's surface and poses, and the first keyframe's pose; if the lens may move, its rotation."""
     first = scene.views[0]
     assert first is not None
     T_map_scene = np.linalg.inv(object_map.keyframes[0].pose.matrix().numpy()) @ first.T_cam_obj
+    if camera.assumed:  # the origin stays in the object: another lens moves both alike
+        centre = T_map_scene[:3, :3] @ scene.vertices.mean(0)
+        T_map_scene[:3, 3] = object_map.vertices.cpu().numpy().mean(0) - centre
     T_scene_map = np.linalg.inv(T_map_scene)
     keyframes = list[Keyframe]()
     for view, drawn in zip(object_map.keyframes, scene.views, strict=True):

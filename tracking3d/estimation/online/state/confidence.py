@@ -23,6 +23,7 @@ _UNSEEN_CHARGE = PoseWeights().unseen
 _FULL_WEIGHT_TEXTURE = 0.8  # share of known texture from which the appearance counts in full
 _MOSTLY_UNSEEN = 0.7  # share of unseen texture
 _MODEL, _FREE_AXIS = LogisticModel.load("pose_confidence"), LogisticModel.load("free_axis_confidence")
+_FINISHED = LogisticModel.load("finished_plain_confidence")
 # What is rendered counts as four points with a loss of .3 (fitted): without inliers the curvature alone decides
 _RENDERED_POINTS, _RENDERED_LOSS = 4, 0.3
 _REASONS = {
@@ -54,6 +55,8 @@ class PoseEvidence:
     has_texture: bool = False  # whether it has texture nevertheless, whose points were not found again
     # (3,) in object coordinates, of a surface of revolution: rotation about it is not judged; None without one
     free_axis: NDArray[np.float64] | None = None
+    # of a finished map without points over other rotations, see `lead_over_rivals`; NaN of other maps
+    lead: float = math.nan
 
     @property
     def is_decisive(self) -> bool:
@@ -107,6 +110,7 @@ def confidence_features(losses: Mapping[str, float], diagnostics: Mapping[str, f
         "missed": diagnostics["mask_confidence"] * (1 - diagnostics["mask_iou"]),
         "unseen_ratio": diagnostics["unseen_ratio"],
         "outlier_ratio": diagnostics.get("outlier_ratio", 0.0),
+        "lead": diagnostics.get("lead", math.nan),
         # logarithm of the standard deviation in degrees of the rotation about the least constrained axis
         "deviation": math.log(TURN) + math.log(variance) / 2,
     }
@@ -159,7 +163,8 @@ def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
     Right means within 10 degrees and above an IoU of 0.7. Rotation about a free axis does not count.
     history/2026-11-28-confidence-with-points.md has its calibration.
     """
-    return (_MODEL if evidence.free_axis is None else _FREE_AXIS).probability(_features(fit, evidence))
+    model = _MODEL if math.isnan(evidence.lead) else _FINISHED
+    return (model if evidence.free_axis is None else _FREE_AXIS).probability(_features(fit, evidence))
 
 
 def _features(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
@@ -172,6 +177,7 @@ def _features(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
             "unseen_ratio": fit.unseen,
             "mask_iou": fit.overlap,
             "mask_confidence": evidence.mask_weight,
+            "lead": evidence.lead,
         },
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -65,6 +65,7 @@ class ObjectMap:
     candidate: NDArray[np.bool_]
     # whether the object has no points that can be tracked: only pixels and outlines constrain it
     pointless: bool = False
+    lead: float = math.nan  # of a finished map without points, see `lead_over_rivals`; NaN of other maps
     renderer: str = "auto"  # which renderer, see `tracking3d.rendering.backend`
     # (8, 2) candidate landmarks in each direction from the object: those that could be tested, and those that
     # move with it
@@ -160,15 +161,20 @@ class ObjectMap:
             surface.texture.permute(1, 2, 0).cpu().numpy(),
         )
 
+    @cached_property
+    def _drawn(self) -> list[tuple[Pose, Camera, NDArray[np.bool_]]]:
+        """The last silhouette: that of a frame's pose is asked for two or three times."""
+        return []
+
     def silhouette(self, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
         """Hard silhouette ``(H, W)`` in the full frame; not to be written to."""
-        return _silhouette(self, pose, camera)
-
-
-@lru_cache(maxsize=1)  # a frame's pose is asked for three times
-def _silhouette(object_map: ObjectMap, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
-    size, vertices = (camera.height, camera.width), object_map.vertices
-    K = torch.tensor(camera.K, dtype=torch.float32, device=vertices.device)
-    screen, depth = project(vertices, pose.R[None], pose.translation[None], K[None])
-    drawn = nearest_depth(screen[0], depth[0], object_map.shape.faces, size, object_map.renderer)
-    return np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's
+        for known, seen_by, mask in self._drawn:
+            if known is pose and seen_by == camera:
+                return mask
+        size = (camera.height, camera.width)
+        K = torch.tensor(camera.K, dtype=torch.float32, device=self.vertices.device)
+        screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
+        drawn = nearest_depth(screen[0], depth[0], self.shape.faces, size, self.renderer)
+        mask = np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's
+        self._drawn[:] = [(pose, camera, mask)]
+        return mask
