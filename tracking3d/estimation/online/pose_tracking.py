@@ -36,6 +36,7 @@ _MAX_INLIER_ERROR = 3.0  # largest reprojection error of an inlier, in pixels at
 _OUTLINE_MARGIN = 8.0  # such pixels from the outline within which points slide over the surface
 # Such pixels, beyond which a point is an outlier
 _MAX_REPROJECTION_ERROR, _MAX_REPROJECTION_ERROR_NEW = 4.0, 16.0
+_NEAR_SCALES = 4.0, 1.0  # such pixels at which a point's loss is log 2, one after the other (chosen)
 # Taken off the cost for each inlier, and for how many at most
 _INLIER_REWARD, _MAX_REWARDED_INLIERS = 0.005, 30
 
@@ -85,8 +86,11 @@ def pose_near(object_map: ObjectMap, camera: Camera, view: Keyframe) -> Pose | N
     if len(points) < ENOUGH_MATURE:
         return None
     position, pixel = object_map.landmarks[points.landmark], points.pixel.astype(np.float64)
-    found = pose_of_tracks(position, pixel, None, camera.K, *pose_arrays(view.pose), scale=pixel_scale(view))
-    return pose_from_arrays(found.R, found.t, object_map.vertices)
+    R, t = pose_arrays(view.pose)
+    for scale in _NEAR_SCALES:
+        found = pose_of_tracks(position, pixel, None, camera.K, R, t, scale * pixel_scale(view))
+        R, t = found.R, found.t
+    return pose_from_arrays(R, t, object_map.vertices)
 
 
 def _is_mature(object_map: ObjectMap, points: FollowedPoints) -> NDArray[np.bool_]:
