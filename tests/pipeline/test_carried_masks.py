@@ -11,7 +11,7 @@ from refining_solver import StandInSolver
 from resumable_runs import Stopped, assert_alike, settings, stop_at
 
 from tracking3d.estimation.estimate import CARRIED, Status
-from tracking3d.estimation.online.features.klt import FollowedPoints, carry
+from tracking3d.estimation.online.features.klt import FollowedPoints, carry, follow
 from tracking3d.pipeline import session
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
 from tracking3d.pipeline.record import record
@@ -149,7 +149,9 @@ def test_a_mask_moves_as_most_points_do():
     mask = np.zeros((120, 160), bool)
     mask[40:90, 50:110] = True
     pixel = np.float32(random.uniform((55, 45), (105, 85), (40, 2)))
-    moved = carry(mask, before, now, FollowedPoints(np.arange(40), pixel))
+    points = FollowedPoints(np.arange(40), pixel)
+    here = follow(before, now, points)
+    moved = carry(mask, points, here)
     expected = cv2.warpAffine(np.float32(mask), affine, (160, 120)) > 0.5
     assert np.count_nonzero(moved & expected) > 0.98 * np.count_nonzero(moved | expected)
-    assert carry(mask, before, now, FollowedPoints(np.arange(5), pixel[:5])) is None
+    assert carry(mask, points, here.only(np.arange(len(here)) < 5)) is None

@@ -39,8 +39,6 @@ from tracking3d.rendering.normal_equations import NormalEquations
 from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
 from tracking3d.rendering.surface import Surface
 
-# mypy: disable-error-code="no-untyped-def"
-
 
 class MatchArrays(NamedTuple):
     """Points ``(N, 3)`` and where they were found ``(N, 2)``; empty if there are none."""

@@ -161,20 +161,10 @@ class ObjectMap:
             surface.texture.permute(1, 2, 0).cpu().numpy(),
         )
 
-    @cached_property
-    def _drawn(self) -> list[tuple[Pose, Camera, NDArray[np.bool_]]]:
-        """The last silhouette: that of a frame's pose is asked for two or three times."""
-        return []
-
     def silhouette(self, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
-        """Hard silhouette ``(H, W)`` in the full frame; not to be written to."""
-        for known, seen_by, mask in self._drawn:
-            if known is pose and seen_by == camera:
-                return mask
+        """Hard silhouette ``(H, W)`` in the full frame."""
         size = (camera.height, camera.width)
         K = torch.tensor(camera.K, dtype=torch.float32, device=self.vertices.device)
         screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
         drawn = nearest_depth(screen[0], depth[0], self.shape.faces, size, self.renderer)
-        mask = np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's
-        self._drawn[:] = [(pose, camera, mask)]
-        return mask
+        return np.isfinite(drawn.cpu().numpy())  # ten times as fast as torch's

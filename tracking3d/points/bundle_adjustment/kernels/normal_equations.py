@@ -189,8 +189,6 @@ def _linearise(bundle, scale, fixed, free_focal, equations):
 # The products that this takes are nearly all of its work. They are taken in tiles that stay in the processor's nearest
 # memory, each entry's sum in ascending order, so that neither tiles nor threads change a digit.
 
-# mypy: disable-error-code="no-untyped-def"
-
 
 _TERMS, _COLUMNS = 48, 32
 """Of a tile of a factor: 12 KB. All of its columns are always computed, since the compiler then knows how many."""
