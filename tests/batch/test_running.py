@@ -11,7 +11,7 @@ import fsspec
 import pytest
 
 from tracking3d.batch import folder as batch_folder
-from tracking3d.batch.folder import read_failures, read_progress
+from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
 from tracking3d.batch.running import run_batch
 from tracking3d.batch.storage import _open
 from tracking3d.batch.summary import COLUMNS, MARKER
@@ -20,11 +20,6 @@ from tracking3d.engines.choosing import InThisProcess
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results.files import try_lock
 from tracking3d.results.run_reader import RunReader
-
-
-def read_result_rows(out):
-    with (Path(out) / "results.csv").open(newline="") as table:
-        return list(csv.DictReader(table))
 
 
 def events(told, name):

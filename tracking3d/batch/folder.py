@@ -121,6 +121,12 @@ def read_failures(out: str) -> list[Failure]:
         raise InputError(f"{join_path(out, FAILURES)} is damaged ({error}); run the batch again.") from error
 
 
+def read_result_rows(out: str) -> list[dict[str, str]]:
+    """The rows of the table of results, as texts."""
+    content = read(join_path(out, RESULTS)) or b""
+    return list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
+
+
 def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")

@@ -24,7 +24,6 @@ from tracking3d.estimation.online.pose_tracking import (
     pose_of_points,
 )
 from tracking3d.estimation.online.relocalization import aligned_keyframes, search_rotations
-from tracking3d.estimation.online.state import object_map as state_of_map
 from tracking3d.geometry.pose import Pose
 
 ANGLES = [-10.0, 0.0, 10.0]
@@ -224,20 +223,3 @@ def test_evidence_is_the_cost_without_points(object_map, surface):
     expected = 2 * fit.appearance + 0.5 * 0.4 * fit.outline + 0.4 * (1 - fit.overlap)
     assert render_cost(fit, weights, 0.4) == pytest.approx(expected)
     assert render_cost(replace(fit, points=9.0), weights, 0.4) == pytest.approx(expected)
-
-
-def test_the_silhouette_of_a_pose_is_drawn_once(object_map, monkeypatch):
-    drawn = []
-    draw = state_of_map.nearest_depth
-    monkeypatch.setattr(state_of_map, "nearest_depth", lambda *given: drawn.append(1) or draw(*given))
-    pose, wide = at(3), replace(CAMERA, fx=0.5 * CAMERA.fx)
-    first = object_map.silhouette(pose, CAMERA)
-    assert object_map.silhouette(pose, CAMERA) is first and len(drawn) == 1
-    # Another lens, pose or surface has another one.
-    others = [
-        object_map.silhouette(pose, wide),
-        object_map.silhouette(at(3, 0.2), CAMERA),
-        replace(object_map, vertices=1.2 * object_map.vertices).silhouette(pose, CAMERA),
-    ]
-    assert len(drawn) == 4
-    assert all((other != first).any() for other in others)

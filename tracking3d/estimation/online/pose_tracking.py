@@ -225,16 +225,18 @@ def pose_predictions(state: Mapped, index: int, mask: NDArray[np.bool_] | None) 
 
 def follow_points(state: Mapped, frame: Frame) -> tuple[Pose, FollowedPoints]:
     """The likeliest pose in the next frame, and the tracked points, searched for where they would be then."""
-    if frame.index not in state.followed:
-        likeliest = next(iter(pose_predictions(state, frame.index, None).values()))
-        points, last, guess = state.tracked_points, state.last_pose[0], None
-        if len(points):
-            position = state.object_map.landmarks[points.landmark]
-            there, here = (project_points(position, pose, state.camera) for pose in (likeliest, last))
-            guess = np.asarray(points.pixel + np.nan_to_num(there - here), dtype=np.float32)
-        found = follow(state.grey, grey(frame.image), points, guess)
-        state.followed[frame.index] = likeliest, found
-    return state.followed[frame.index]
+    for image, likeliest, found in state.followed:
+        if image is frame.image:
+            return likeliest, found
+    likeliest = next(iter(pose_predictions(state, frame.index, None).values()))
+    points, last, guess = state.tracked_points, state.last_pose[0], None
+    if len(points):
+        position = state.object_map.landmarks[points.landmark]
+        there, here = (project_points(position, pose, state.camera) for pose in (likeliest, last))
+        guess = np.asarray(points.pixel + np.nan_to_num(there - here), dtype=np.float32)
+    found = follow(state.grey, grey(frame.image), points, guess)
+    state.followed[:] = [(frame.image, likeliest, found)]
+    return likeliest, found
 
 
 def is_consistent_with_motion(state: Mapped, pose: Pose, index: int) -> bool:

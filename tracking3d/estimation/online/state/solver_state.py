@@ -121,9 +121,9 @@ class Mapped(_AnyState):
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
 
     @cached_property
-    def followed(self) -> dict[int, tuple[Pose, FollowedPoints]]:
-        """By index what `pose_tracking.follow_points` found in next frames: one whose mask is carried asks twice."""
-        return {}
+    def followed(self) -> list[tuple[NDArray[np.uint8], Pose, FollowedPoints]]:
+        """The last image `pose_tracking.follow_points` saw, and its result: frames with carried masks ask twice."""
+        return []
 
     @property
     def lost(self) -> bool:
