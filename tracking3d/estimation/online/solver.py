@@ -7,7 +7,6 @@ made of stands in the rooms beside them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -66,7 +65,7 @@ from tracking3d.estimation.solver import (
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import pose_from_arrays, rotation_angle
+from tracking3d.geometry.pose import pose_from_arrays
 from tracking3d.runtime.stage_times import in_stage
 
 _MIN_MASK_IOU = 0.3
@@ -340,18 +339,10 @@ class OnlineSolver:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
         return self.initializer.finish_background_work(state)
 
-    def carry_mask(
-        self, state: SolverState, frame: Frame, mask: NDArray[np.bool_]
-    ) -> NDArray[np.bool_] | None:
-        """The last frame's mask ``(H, W)`` in the next one, moved as the tracked points are.
-
-        None if the object turns so fast that every second frame is a keyframe: those need masks of their own.
-        """
-        if isinstance(state, Initializing) or state.previous_pose is None:
-            return None
-        (before, since), (last, index) = state.previous_pose, state.last_pose
-        turned = math.degrees(float(rotation_angle(before.quaternion, last.quaternion)))
-        if turned > self.options.keyframe_rotation / 2 * (index - since):
+    @staticmethod
+    def carry_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """The last frame's mask ``(H, W)`` in the next one, moved as the tracked points are."""
+        if isinstance(state, Initializing):
             return None
         return carry(mask, state.tracked_points, follow_points(state, frame)[1])
 
