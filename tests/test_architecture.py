@@ -34,7 +34,7 @@ ROOM_LINES = {
     "config": 1450,
     "engines": 900,
     "errors": 50,
-    "estimation": 14450,  # kernels of the joint fit; carried masks; photos merged; masks tried; poses by points
+    "estimation": 14500,  # kernels of the joint fit; carried masks; photos merged; poses by points; live landmarks
     "export": 2550,
     "features": 1500,  # the protocol of keypoint detectors, and a network for it
     "frames": 150,

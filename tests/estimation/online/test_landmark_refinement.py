@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from threading import Event
 
 import numpy as np
 import pytest
@@ -12,7 +13,11 @@ from online_runs import estimate_of, solver
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
-from tracking3d.estimation.online.mapping.global_refinement import refine_by_landmarks
+from tracking3d.estimation.online.mapping.global_refinement import (
+    adopt_refinement,
+    refine_by_landmarks,
+    refine_in_background,
+)
 from tracking3d.estimation.online.mapping.keyframe_insertion import refine_local_map
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.pose_tracking import resect_pose
@@ -23,6 +28,7 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.online.tracker import Tracker
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
+from tracking3d.runtime.background_attempt import BackgroundAttempt
 from tracking3d.testing.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d_bench.evaluation.metrics import aligned_rotation_errors
 
@@ -250,3 +256,42 @@ def test_of_the_frames_that_are_refined_lost_ones_alone_are_searched_as_a_whole(
     T_cam_obj = state.last_pose[0].matrix().numpy()
     online.refine_frame(state, Frame(4, frame), estimate_of(clip().masks[4]), T_cam_obj)
     assert bool(searched) == lost
+
+
+def test_another_thread_refines_the_same_and_poses_move_with_the_last_keyframe():
+    state = disturbed()
+    begun = refine_in_background(state, solver().options)
+    assert begun.object_map is state.object_map and begun.refinement is not None
+    found, expected = adopt_refinement(begun, wait=None), refine(state)
+    assert found.refinement is None and found.camera == expected.camera
+    assert torch.equal(found.object_map.vertices, expected.object_map.vertices)
+
+    def from_keyframe(state):
+        last, keyframe = state.last_pose[0].matrix(), state.object_map.keyframes[-1].pose.matrix()
+        return last @ torch.linalg.inv(keyframe)
+
+    assert torch.allclose(from_keyframe(found), from_keyframe(state), atol=1e-4)
+    assert not torch.allclose(found.last_pose[0].matrix(), state.last_pose[0].matrix(), atol=1e-3)
+
+
+def test_a_refinement_of_another_map_or_of_none_is_dropped():
+    state = disturbed()
+    begun = refine_in_background(state, solver().options)
+    other = replace(begun, object_map=replace(state.object_map))
+    assert adopt_refinement(other, wait=None).object_map is other.object_map
+    done = replace(state.object_map, asked_landmarks=state.object_map.keyframes[-1].index)
+    assert refine_in_background(replace(state, object_map=done), solver().options).refinement is None
+
+
+def test_a_live_source_gets_no_keyframe_while_its_map_is_refined(monkeypatch):
+    monkeypatch.setattr("tracking3d.estimation.online.solver.needs_keyframe", lambda *_: True)
+    live, state = solver().for_live_source(), tracked()
+    index = state.last_pose[1] + 1
+    image, mask = clip().images[-1], estimate_of(clip().masks[-1])
+    busy = BackgroundAttempt(lambda: (Event().wait(0.5), ()), None)
+    waiting = replace(state, refinement=(state.object_map, busy))
+    assert not live.step(waiting, Frame(index, image), mask)[1].keyframe
+    begun, estimate = live.step(state, Frame(index, image), mask)
+    assert estimate.keyframe and begun.refinement is not None
+    ended, _ = live.finish_background_work(begun)
+    assert ended.refinement is None and ended.object_map.asked_landmarks == index

@@ -55,7 +55,12 @@ _SCALE = 1.0  # pixels
 
 
 def insert_frame(
-    state: Mapped, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig, detector: Detector = SIFT
+    state: Mapped,
+    view: Keyframe,
+    image: NDArray[np.uint8],
+    config: OnlineConfig,
+    detector: Detector = SIFT,
+    by_landmarks: bool = True,
 ) -> Mapped:
     """The state with its last frame as a new keyframe, and the map refined.
 
@@ -65,11 +70,13 @@ def insert_frame(
         image: ``(H, W)`` grey.
         config: The solver's options.
         detector: What finds keypoints.
+        by_landmarks: Whether also by dense landmarks.
     """
     object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config, detector)
     last = object_map.keyframes[-1].pose, view.index
     state = state.with_map(object_map, last_pose=last, tracked_points=followed)
-    return refine_by_landmarks(fix_depth_reversal(state, config), config)
+    state = fix_depth_reversal(state, config)
+    return refine_by_landmarks(state, config) if by_landmarks else state
 
 
 def adopt_free_axis(state: Mapped, config: OnlineConfig) -> Mapped:

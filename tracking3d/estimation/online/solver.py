@@ -24,6 +24,7 @@ from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initializer import Initializer
 from tracking3d.estimation.online.mapper import adopt_free_axis, insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
+from tracking3d.estimation.online.mapping.global_refinement import adopt_refinement, refine_in_background
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, view_frame
 from tracking3d.estimation.online.masks import (
     initial_estimate,
@@ -121,9 +122,10 @@ class OnlineSolver:
         if isinstance(state, Initializing):
             return self.initializer.add(state, frame, image, binary)
         state, revised = self.initializer.restart_if_misfit(state)
-        if not self.initializer.in_background:  # it takes seconds, for which a live source would wait
-            state = adopt_free_axis(state, self.options)
-        state, estimate = self._track(state, frame, image, binary, self.options, not mask.carried)
+        # A live source would wait for what takes seconds.
+        state = adopt_refinement(state) if self.in_background else adopt_free_axis(state, self.options)
+        may_insert = not mask.carried and state.refinement is None
+        state, estimate = self._track(state, frame, image, binary, self.options, may_insert)
         if binary is not None and atlas.needs_second_map(state, image, binary):
             state, estimate = self._recover(state, estimate, frame, image, binary)
         estimate = replace(estimate, revised=(*revised, *estimate.revised))
@@ -154,10 +156,13 @@ class OnlineSolver:
         if is_keyframe:
             with in_stage("map"):
                 view = replace(found.view, pose=pose, points=found.points)
-                updated = insert_frame(updated, view, image, options, self.detector)
+                settle = not self.in_background
+                updated = insert_frame(updated, view, image, options, self.detector, settle)
                 updated = atlas.merge_maps(updated, options, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)
+            if self.in_background:
+                updated = refine_in_background(updated, options)
             pose = updated.last_pose[0]
         if found.lost:
             updated = replace(updated, previous_pose=None)
@@ -337,7 +342,8 @@ class OnlineSolver:
 
     def finish_background_work(self, state: SolverState) -> tuple[SolverState, FrameEstimate | None]:
         """See `tracking3d.estimation.solver.RefiningSolver`."""
-        return self.initializer.finish_background_work(state)
+        state, found = self.initializer.finish_background_work(state)
+        return (adopt_refinement(state, wait=None) if isinstance(state, Mapped) else state), found
 
     @staticmethod
     def carry_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

@@ -26,9 +26,10 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import Mapped
 from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import pose_from_arrays
+from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.points.landmark_adjustment import LandmarkScene, is_supported, refine_through
 from tracking3d.points.robust_bundle import intersect
+from tracking3d.runtime.background_attempt import BackgroundAttempt
 
 _PASSES = 3
 _VIEWS_WITHOUT_POINTS, _EVALUATIONS = 16, 12  # without points (chosen; 15 evaluations more: no gain)
@@ -148,6 +149,44 @@ def refine_by_landmarks(state: Mapped, config: OnlineConfig) -> Mapped:
     if state.last_pose[1] == newest:
         state = replace(state, last_pose=(object_map.keyframes[-1].pose, newest))
     return state.with_map(object_map)
+
+
+def refine_in_background(state: Mapped, config: OnlineConfig) -> Mapped:
+    """The state whose map is being refined by dense landmarks in another thread, if that is due."""
+    object_map = state.object_map
+    if object_map.pointless or object_map.fixed_keyframes or not _is_due(object_map):
+        return state
+    snapshot = replace(state, object_map=replace(object_map))  # with drawings of its own
+    attempt = BackgroundAttempt[Mapped, None, None](
+        lambda: (refine_by_landmarks(snapshot, config), ()), lambda refined, _: (refined, [])
+    )
+    return replace(state, refinement=(object_map, attempt))
+
+
+def adopt_refinement(state: Mapped, wait: float | None = 0.0) -> Mapped:
+    """The state with the map that another thread has refined, once that is done; poses move with its last keyframe.
+
+    It is dropped if the state has another map by now, or if the other thread has failed.
+
+    Args:
+        state: The state.
+        wait: Most seconds to wait for it; no limit if None.
+    """
+    if state.refinement is None or not state.refinement[1].is_done(wait):
+        return state
+    (before, attempt), state = state.refinement, replace(state, refinement=None)
+    if attempt.has_failed or state.object_map is not before:
+        return state
+    refined: Mapped = attempt.outcome().state
+    state = state_through_lens(state, refined.camera)
+    from_old = np.linalg.inv(state.object_map.keyframes[-1].pose.matrix().numpy().astype(np.float64))
+    to_new = refined.object_map.keyframes[-1].pose.matrix().numpy()
+
+    def move(pose: Pose) -> Pose:
+        T = pose.matrix().numpy() @ from_old @ to_new
+        return pose_from_arrays(T[:3, :3], T[:3, 3], pose.translation)
+
+    return state.moved(refined.object_map, move, motion_references=state.motion_references)
 
 
 def _is_due(object_map: ObjectMap) -> bool:

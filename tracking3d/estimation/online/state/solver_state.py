@@ -119,6 +119,8 @@ class Mapped(_AnyState):
     # Frames of a map without points, at most `MOST_WAITING`, evenly spaced; if it is restarted, they are
     # estimated with the new map. Empty if it cannot be restarted.
     revisable: tuple[tuple[Keyframe, FrameEstimate], ...] = ()
+    # the map as it was, and its refinement by dense landmarks in another thread; None if there is none
+    refinement: tuple[ObjectMap, BackgroundAttempt[Any, Any, Any]] | None = None
 
     @cached_property
     def followed(self) -> list[tuple[NDArray[np.uint8], Pose, FollowedPoints]]:
