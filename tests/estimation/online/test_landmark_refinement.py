@@ -258,20 +258,33 @@ def test_of_the_frames_that_are_refined_lost_ones_alone_are_searched_as_a_whole(
     assert bool(searched) == lost
 
 
-def test_another_thread_refines_the_same_and_poses_move_with_the_last_keyframe():
+@pytest.mark.parametrize("is_given", [True, False])
+def test_another_thread_refines_the_same_and_poses_move_with_the_last_keyframe(is_given):
     state = disturbed()
+    if not is_given:
+        wrong = replace(clip().camera.zoom(0.7, "assumed"), assumed=True)
+        state = state_through_lens(state, wrong)
     begun = refine_in_background(state, solver().options)
     assert begun.object_map is state.object_map and begun.refinement is not None
     found, expected = adopt_refinement(begun, wait=None), refine(state)
     assert found.refinement is None and found.camera == expected.camera
+    assert (found.camera == state.camera) == is_given
     assert torch.equal(found.object_map.vertices, expected.object_map.vertices)
 
     def from_keyframe(state):
         last, keyframe = state.last_pose[0].matrix(), state.object_map.keyframes[-1].pose.matrix()
         return last @ torch.linalg.inv(keyframe)
 
-    assert torch.allclose(from_keyframe(found), from_keyframe(state), atol=1e-4)
-    assert not torch.allclose(found.last_pose[0].matrix(), state.last_pose[0].matrix(), atol=1e-3)
+    through = state_through_lens(state, found.camera)
+    assert torch.allclose(from_keyframe(found), from_keyframe(through), atol=1e-4)
+    assert not torch.allclose(found.last_pose[0].matrix(), through.last_pose[0].matrix(), atol=1e-3)
+
+
+def test_a_refinement_that_fails_leaves_the_map_as_it_is():
+    state = tracked()
+    failing = BackgroundAttempt(lambda: 1 / 0, None)
+    left = adopt_refinement(replace(state, refinement=(state.object_map, failing)), wait=None)
+    assert left.refinement is None and left.object_map is state.object_map
 
 
 def test_a_refinement_of_another_map_or_of_none_is_dropped():

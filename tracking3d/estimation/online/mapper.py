@@ -6,6 +6,7 @@ The initialization chooses between the two reversals; after a small rotation its
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -60,7 +61,7 @@ def insert_frame(
     image: NDArray[np.uint8],
     config: OnlineConfig,
     detector: Detector = SIFT,
-    by_landmarks: bool = True,
+    refine: Callable[[Mapped, OnlineConfig], Mapped] = refine_by_landmarks,
 ) -> Mapped:
     """The state with its last frame as a new keyframe, and the map refined.
 
@@ -70,13 +71,12 @@ def insert_frame(
         image: ``(H, W)`` grey.
         config: The solver's options.
         detector: What finds keypoints.
-        by_landmarks: Whether also by dense landmarks.
+        refine: What refines the map by dense landmarks: here, or in another thread.
     """
     object_map, followed = insert_keyframe(state.object_map, state.camera, view, image, config, detector)
     last = object_map.keyframes[-1].pose, view.index
     state = state.with_map(object_map, last_pose=last, tracked_points=followed)
-    state = fix_depth_reversal(state, config)
-    return refine_by_landmarks(state, config) if by_landmarks else state
+    return refine(fix_depth_reversal(state, config), config)
 
 
 def adopt_free_axis(state: Mapped, config: OnlineConfig) -> Mapped:

@@ -24,7 +24,11 @@ from tracking3d.estimation.online.features.sift import SIFT, Detector
 from tracking3d.estimation.online.initializer import Initializer
 from tracking3d.estimation.online.mapper import adopt_free_axis, insert_frame
 from tracking3d.estimation.online.mapping.focal_length import state_through_lens
-from tracking3d.estimation.online.mapping.global_refinement import adopt_refinement, refine_in_background
+from tracking3d.estimation.online.mapping.global_refinement import (
+    adopt_refinement,
+    refine_by_landmarks,
+    refine_in_background,
+)
 from tracking3d.estimation.online.mapping.keyframe_insertion import needs_keyframe, view_frame
 from tracking3d.estimation.online.masks import (
     initial_estimate,
@@ -156,13 +160,11 @@ class OnlineSolver:
         if is_keyframe:
             with in_stage("map"):
                 view = replace(found.view, pose=pose, points=found.points)
-                settle = not self.in_background
-                updated = insert_frame(updated, view, image, options, self.detector, settle)
+                refine = refine_in_background if self.in_background else refine_by_landmarks
+                updated = insert_frame(updated, view, image, options, self.detector, refine)
                 updated = atlas.merge_maps(updated, options, updated.object_map.keyframes[-1:])
                 if self.config.has_given_masks:
                     updated = measure_mask_agreement(updated)
-            if self.in_background:
-                updated = refine_in_background(updated, options)
             pose = updated.last_pose[0]
         if found.lost:
             updated = replace(updated, previous_pose=None)
@@ -316,9 +318,10 @@ class OnlineSolver:
         aside, options = state.inactive_maps, refiner.with_more_keyframes(self.options)
         number = max(state.last_pose[1], *(view.index for view in state.object_map.keyframes)) + 1
         state, estimates = refiner.enter_gap(state, gap, number), list[FrameEstimate]()
+        ended = replace(self, in_background=False)  # a live source that has ended waits for nothing
         for frame, mask in gap.frames:
             shown = replace(frame, index=number + abs(frame.index - gap.anchor.index))
-            state, estimate = self._track(state, shown, grey(frame.image), mask.found, options)
+            state, estimate = ended._track(state, shown, grey(frame.image), mask.found, options)
             estimates.append(replace(without_masks(estimate), index=frame.index))
         return replace(refiner.leave_gap(state, gap, number), inactive_maps=aside), estimates
 

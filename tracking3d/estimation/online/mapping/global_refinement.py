@@ -137,7 +137,7 @@ def refine_by_landmarks(state: Mapped, config: OnlineConfig) -> Mapped:
         config: The solver's options.
     """
     object_map = state.object_map
-    if object_map.pointless or object_map.fixed_keyframes or not _is_due(object_map):
+    if not _is_due(object_map):
         return state
     newest = object_map.keyframes[-1].index
     object_map = replace(object_map, asked_landmarks=newest)
@@ -154,7 +154,7 @@ def refine_by_landmarks(state: Mapped, config: OnlineConfig) -> Mapped:
 def refine_in_background(state: Mapped, config: OnlineConfig) -> Mapped:
     """The state whose map is being refined by dense landmarks in another thread, if that is due."""
     object_map = state.object_map
-    if object_map.pointless or object_map.fixed_keyframes or not _is_due(object_map):
+    if not _is_due(object_map):
         return state
     snapshot = replace(state, object_map=replace(object_map))  # with drawings of its own
     attempt = BackgroundAttempt[Mapped, None, None](
@@ -190,7 +190,9 @@ def adopt_refinement(state: Mapped, wait: float | None = 0.0) -> Mapped:
 
 
 def _is_due(object_map: ObjectMap) -> bool:
-    """Whether enough keyframes are new since the map was last refined."""
+    """Whether a map can be refined, and enough keyframes are new since it was."""
+    if object_map.pointless or object_map.fixed_keyframes:
+        return False
     count = len(object_map.keyframes)
     new = sum(view.index > object_map.asked_landmarks for view in object_map.keyframes)
     return count >= _LEAST_KEYFRAMES and new >= max(1.0, _NEW_SHARE * count)
